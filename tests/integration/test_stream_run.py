@@ -67,7 +67,7 @@ def test_a_client_receives_what_the_run_folder_keeps(recording, sheet, tmp_path,
     scene, *frames = streamed_run(recording, tmp_path / "run", capsys, *more)
     assert [part["name"] for part in scene["objects"]] == ["sheet"]
     numbers = [message["frame"] for message in frames]
-    # Of two passes the second is told.
+    # Of two passes the second is sent.
     assert numbers == sorted(set(numbers))
     assert numbers[-1] == len(TIMES) - 1
     assert len(numbers) >= 3

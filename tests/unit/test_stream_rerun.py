@@ -80,7 +80,7 @@ def test_parameters_forces_and_status_over_the_frames(recorded):
         force = found["/forces/block/left\\ end", "scalars"][frame]
         assert force == pytest.approx([-400.0 * stretch, 0.0, 5000.0 * slide])
     assert np.isnan(found["/parameters/block/slide", "scalars"][13]).all()
-    # A text is told when it changes.
+    # A text is logged when it changes.
     assert list(found["/status/block", "text"]) == [10, 13]
     assert "4 of 300 points" in found["/status/block", "text"][13][0]
     assert found["/status/block", "level"][13] == ["ERROR"]

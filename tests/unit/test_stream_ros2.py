@@ -79,7 +79,7 @@ def round_trip(store, message):
 
 @pytest.fixture(params=STORES, ids=lambda store: store.value)
 def told(request):
-    """What each topic is told of a tracked frame and of a lost one, and the definitions."""
+    """What each topic carries of a tracked frame and of a lost one, and the definitions."""
     kept, model, store = Kept(), held_block_model(), get_typestore(request.param)
     sink = StreamSink([kept]).begin({"run": StreamedObject(model, "my block")}, CAMERA)
     sink(tracked_frame(4, 12.25, run=tracked_result(model, STRETCH, SLIDE)))

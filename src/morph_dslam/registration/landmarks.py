@@ -33,7 +33,7 @@ from morph_dslam.registration.messages import (
     UnusualSize,
     WrongUnit,
 )
-from morph_dslam.registration.outline_snap import OutlineSnap
+from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, are_distinct, mesh_in_camera
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.depth import SIGMA_AT_1M
@@ -46,9 +46,8 @@ Array = NDArray[np.float64]
 CLICK_PX, POOR_FIT, POOR_SHARE = 0.5, 2.0, 1.0 / 800.0
 #: Standard deviation of landmarks' pixels where they are too few to show it, and the least that is believed.
 UNKNOWN_PX, LEAST_PX = 2.0, 0.1
-#: Shares of the object's size: least extent of the landmarks, how far one may lie off the undeformed surface,
-#: and how far apart different minima are (mean over the mesh, in the camera frame).
-SPREAD_SHARE, SURFACE_SHARE, DISTINCT_SHARE = 0.12, 0.01, 0.02
+#: Shares of the object's size: least extent of the landmarks, and how far one may lie off the undeformed surface.
+SPREAD_SHARE, SURFACE_SHARE = 0.12, 0.01
 #: Largest residual (root mean square) as a share of the image's diagonal.
 RESIDUAL_SHARE = 0.005
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
@@ -296,23 +295,18 @@ def _in_front(points: Array, rotations: Sequence[Any], translations: Sequence[An
 
 def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, tuple[State, ...]]:
     """The best minimum, and different ones that landmarks of the stated accuracy cannot exclude."""
-    limit = DISTINCT_SHARE * _extent(model.nodes)
     best = found[0]
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
     variance = max(click_px**2, 2.0 * best.cost / freedom)
-    # Twice the log-likelihood ratio of two minima; 9 is the three-sigma level.
-    plausible = [e for e in found if 2.0 * (e.cost - best.cost) < 9.0 * variance]
-    shapes, states = [_mesh_in_camera(model, best.state)], []
+    # Twice the log-likelihood ratio of two minima.
+    plausible = [e for e in found if 2.0 * (e.cost - best.cost) < EXCLUDED * variance]
+    shapes, states = [mesh_in_camera(model, best.state)], []
     for estimate in plausible:
-        shape = _mesh_in_camera(model, estimate.state)
-        if all(np.linalg.norm(shape - other, axis=1).mean() > limit for other in shapes):
+        shape = mesh_in_camera(model, estimate.state)
+        if all(are_distinct(model, shape, other) for other in shapes):
             shapes.append(shape)
             states.append(estimate.state)
     return best, tuple(states)
-
-
-def _mesh_in_camera(model: ReducedModel, state: State) -> Array:
-    return state.camera_from_object.apply(model.positions(state.parameters))
 
 
 def _check_residual(best: Estimate, rms: float, limit: float) -> None:

@@ -64,7 +64,7 @@ FINE = np.array([0.05, 0.04, 0.04, 0.03, 0.03, 0.025, 0.025, 0.02, 0.02, 0.02])
 TOLERANCE = 0.015
 #: A lower score is no evidence.
 FEWEST_EXPLAINED = 20
-#: Other places that are told of.
+#: Other places that are kept.
 MOST_RIVALS = 3
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8

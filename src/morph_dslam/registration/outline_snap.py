@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from morph_dslam.model import ReducedModel
 from morph_dslam.registration.messages import OutlineContradicts, OutlineUnseen, RegistrationWarning
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State
@@ -32,6 +33,17 @@ LEAST_SEEN = 0.5
 EXCLUDED, DISTINCT_SHARE = 9.0, 0.02
 #: Chance by which landmarks of the size of error that they show fit so much worse beside the right outline.
 LEAST_CHANCE = 1e-3
+
+
+def mesh_in_camera(model: ReducedModel, state: State) -> Array:
+    """The nodes (n, 3) of a model in a state, in the camera frame, metres."""
+    return state.camera_from_object.apply(model.positions(state.parameters))
+
+
+def are_distinct(model: ReducedModel, one: Array, other: Array) -> bool:
+    """Whether the nodes (n, 3) of two states, in the camera frame, are so far apart that these are different ones."""
+    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    return float(np.linalg.norm(one - other, axis=1).mean()) > DISTINCT_SHARE * size
 
 
 @dataclass(frozen=True)
@@ -126,9 +138,7 @@ class OutlineSnap:
     def _apart(self, one: State, other: State) -> bool:
         """Whether two states are different ones."""
         model = self._estimator.model
-        a, b = (state.camera_from_object.apply(model.positions(state.parameters)) for state in (one, other))
-        size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
-        return float(np.linalg.norm(a - b, axis=1).mean()) > DISTINCT_SHARE * size
+        return are_distinct(model, mesh_in_camera(model, one), mesh_in_camera(model, other))
 
     def _agreeing(self, seen: OutlineMeasurement, state: State) -> OutlineMeasurement:
         """Those points of an outline that are as far off the state as most of them, or less."""

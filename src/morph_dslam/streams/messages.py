@@ -1,4 +1,4 @@
-"""What is told to other programs: a scene once, then a message for each frame. Every kind of stream is made from these.
+"""What is sent to other programs: a scene once, then a message for each frame. Every kind of stream is made from these.
 
 All values are in SI units. The camera looks along +z, with x to the right and y down in its image.
 """

@@ -19,7 +19,7 @@ def scene_packet(scene: SceneMessage, colours: list[list[int]]) -> bytes:
 
     Parameters
     ----------
-    scene : that is told.
+    scene : that is sent.
     colours : the colour map, red, green, blue, alpha from 0 to 255 of each step.
     """
     camera, arrays = scene.camera, {}

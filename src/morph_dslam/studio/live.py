@@ -196,7 +196,7 @@ class LiveRelay:
     # -- browsers -----------------------------------------------------------------------------------
 
     def facts(self) -> dict[str, Any]:
-        """What pages are told: the camera that sends, why its frames are not taken, and whether they are tracked."""
+        """What pages show: the camera that sends, why its frames are not taken, and whether they are tracked."""
         return {"camera": self._what, "refused": self._refusal, "tracking": self._is_tracking}
 
     def _tell_all(self) -> None:
