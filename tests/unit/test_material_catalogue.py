@@ -20,7 +20,7 @@ ENTRIES = {entry.name: entry for entry in material_catalogue()}
 
 def number(text):
     value, unit = text.split()
-    return float(value) * {"kPa": 1e3, "MPa": 1e6}[unit]
+    return float(value) * {"kPa": 1e3, "MPa": 1e6, "GPa": 1e9}[unit]
 
 
 @pytest.mark.parametrize("name", TESTS)
@@ -57,6 +57,17 @@ def test_the_mold_stars_of_shore_15_and_16_are_about_as_stiff():
     """Two data sets, two laws, two makes of nearly one hardness: initial shear moduli 2 c10 within a fifth."""
     fifteen, sixteen = (number(ENTRIES[f"mold_star_{shore}"].section["c10"]) for shore in (15, 16))
     assert fifteen == pytest.approx(sixteen, rel=0.2)
+
+
+def test_paper_has_the_young_s_modulus_of_its_tensile_tests():
+    assert number(ENTRIES["paper"].section["young"]) == pytest.approx(5.32e9)
+
+
+def test_foam_is_within_the_range_of_its_density():
+    """Gibson and Ashby, Cellular Solids: E / Es = (rho / rhos)^2; polyurethane has 1200 kg/m3, 45 to 1600 MPa."""
+    section = ENTRIES["soft_foam"].section
+    relative = float(section["density"].split()[0]) / 1200
+    assert 45e6 * relative**2 < number(section["young"]) < 1600e6 * relative**2
 
 
 def test_liver_has_its_shear_modulus():

@@ -45,6 +45,16 @@ _FIRST_LOADING = f"First loading in tension, up to three times the length. {_BUL
 
 _CATALOGUE: tuple[CataloguedMaterial, ...] = (
     CataloguedMaterial(
+        name="paper",
+        title="Paper for printers",
+        section={"law": "st_venant_kirchhoff", "young": "5.32 GPa", "poisson": 0.3},
+        source="tensile tests of strips, supplement of a study of self-folding corrugated paper, "
+        "yvm2020.authorea.com/users/450520/articles/549430",
+        note="Tension up to 0.25 % strain, in one direction, which is not stated. Paper is about half as stiff across the "
+        "machine's direction as along it. Poisson's ratio chosen. Thin sheets are better solved as shells, with the same "
+        "two constants.",
+    ),
+    CataloguedMaterial(
         name="natural_rubber",
         title="Natural rubber (Treloar)",
         section={
@@ -71,6 +81,14 @@ _CATALOGUE: tuple[CataloguedMaterial, ...] = (
         "github.com/slslesarenko/jupyterWSM (examples/rubber_tension)",
         note="First loading in tension, up to 1.5 times the length, within 5 %; a strip of another batch, 3 %. Printed "
         f"rubber is softer when pulled slowly. {_BULK}",
+    ),
+    CataloguedMaterial(
+        name="soft_foam",
+        title="Soft open-cell foam",
+        section={"law": "neo_hookean", "young": "130 kPa", "poisson": 0.3, "density": "33 kg/m3"},
+        source="J.-F. Allard, N. Atalla, Propagation of Sound in Porous Media (2009), table 11.3, as transcribed in "
+        "github.com/Matael/PLANES-Materials",
+        note="Small strains: cell walls buckle from about 5 % of compression on, and the foam becomes much softer.",
     ),
     CataloguedMaterial(
         name="mold_star_16",
