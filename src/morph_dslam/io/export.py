@@ -301,9 +301,10 @@ def export(
     ------
     ModelFileError
         If the model cannot be read.
+    ParameterError
+        If the model does not hold what is to be shown.
     ExportError
-        If the states are not in the model's box, the model does not hold what is to be shown, or the folder cannot be
-        written.
+        If the states are not in the model's box, or the folder cannot be written.
     """
     if show is not None and file_format != "gltf":
         raise ExportError("show (--show) chooses the colours of a glTF file; XDMF and VTU files hold all fields")

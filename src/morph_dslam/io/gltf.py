@@ -22,18 +22,13 @@ from tqdm import tqdm
 from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.reduced_model import equivalent_strain, von_mises
+from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 
 Array = NDArray[np.float64]
 Colours = Literal["stress", "strain", "displacement", "none"]
 
 FRAMES_PER_SECOND = 12.0
-#: Colours from 0 to this percentile of all values that are written: stress has narrow peaks.
-PERCENTILE = 99.5
 COLOUR_MAP = "turbo"
-_LABELS = {
-    "stress": ("von Mises stress", "MPa"), "strain": ("equivalent strain", "%"), "displacement": ("displacement", "mm"),
-}  # fmt: skip
 #: Bytes of a vertex in one state: three floats, and a colour of four 16-bit numbers.
 _VERTEX_BYTES = 20
 #: Lengths in the file are unsigned 32-bit numbers; the rest is left for what is no vertex.
@@ -93,12 +88,16 @@ def write_glb(path: Path, model: ReducedModel, states: Array, show: Colours | No
 
     Raises
     ------
+    ParameterError
+        If the model does not hold what is to be shown.
     ExportError
-        If the model does not hold what is to be shown, or the file would be larger than glTF allows.
+        If the file would be larger than glTF allows.
     """
     buffer = _Buffer()
-    shown = _shown(model, show)
-    content = _modes(buffer, model, states) if shown == "none" else _coloured(buffer, model, states, shown)
+    if show == "none" or not model.parameters:  # a rigid object has nothing to be coloured by
+        content = _modes(buffer, model, states)
+    else:
+        content = _coloured(buffer, model, states, shown_field(model, show))
     document = {
         "asset": {"version": "2.0", "generator": f"morph-dslam {__version__}"},
         "scene": 0,
@@ -115,16 +114,6 @@ def write_glb(path: Path, model: ReducedModel, states: Array, show: Colours | No
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", buffer.length, b"BIN\0"))
         file.writelines(buffer.parts)
-
-
-def _shown(model: ReducedModel, show: Colours | None) -> Colours:
-    has = {"stress": bool(model.stresses), "strain": model.strain is not None, "displacement": True, "none": True}
-    if show is None:
-        return "stress" if has["stress"] else "displacement"
-    if not has.get(show, False):
-        held = ", ".join(name for name, held in has.items() if held)
-        raise ExportError(f"the model '{model.name}' holds no {show} to show (--show); it has: {held}")
-    return show
 
 
 def _material(colour: list[float]) -> dict[str, Any]:
@@ -161,24 +150,25 @@ def _modes(buffer: _Buffer, model: ReducedModel, states: Array) -> dict[str, Any
     return content
 
 
-def _coloured(buffer: _Buffer, model: ReducedModel, states: Array, show: Colours) -> dict[str, Any]:
+def _coloured(buffer: _Buffer, model: ReducedModel, states: Array, show: Shown) -> dict[str, Any]:
     """A mesh a state, all but the first one hidden, and the animation that shows them in turn."""
-    used, corners = np.unique(model.triangles, return_inverse=True)
-    size = _VERTEX_BYTES * len(used) * len(states)
+    points, triangles = surface_points(model)
+    rest, field = model.nodes[points.corners[:, 0]], ShownField(model, points, show)
+    size = _VERTEX_BYTES * len(rest) * len(states)
     if size > _MOST_BYTES:
         raise ExportError(
-            f"{len(states)} states of {len(used)} coloured points take {size / 2**30:.1f} GB, and a glTF file has "
+            f"{len(states)} states of {len(rest)} coloured points take {size / 2**30:.1f} GB, and a glTF file has "
             "4 GB at most: choose fewer states, or --show none, which writes the modes"
         )
-    surface = _Surface(model, used, show)
-    values = np.array([surface.values(mu) for mu in tqdm(states, desc="states", unit="state")], dtype=np.float32)
-    top = float(np.percentile(values, PERCENTILE)) or 1.0
+    moved = [field.displacement(mu) for mu in tqdm(states, desc="states", unit="state")]
+    values = [field.values(mu, u) for mu, u in zip(states, moved, strict=True)]
+    _, top = field.range_of(values)
     # Positions are relative to the middle, and nodes stand there, so that hidden ones do not widen what is framed.
     nodes: list[dict[str, Any]] = [{"name": model.name, "rotation": _Z_UP, "children": []}]
-    middle, indices, meshes = surface.rest.mean(axis=0), buffer.add(corners.ravel(), _INDICES), []
-    for i, mu in enumerate(states):
+    middle, indices, meshes = rest.mean(axis=0), buffer.add(triangles.ravel(), _INDICES), []
+    for i, u in enumerate(moved):
         attributes = {
-            "POSITION": buffer.add(surface.positions(mu) - middle, _VERTICES),
+            "POSITION": buffer.add(rest - middle + u, _VERTICES),
             "COLOR_0": buffer.add(_linear_colours(values[i] / top), _VERTICES),
         }
         primitive = {"attributes": attributes, "indices": indices, "material": 0}
@@ -186,8 +176,8 @@ def _coloured(buffer: _Buffer, model: ReducedModel, states: Array, show: Colours
         scale = {} if i == 0 else {"scale": [0.0, 0.0, 0.0]}
         nodes.append({"name": f"state {i}", "mesh": i, "translation": middle.tolist(), **scale})
         nodes[0]["children"].append(i + 1)
-    label, unit = _LABELS[show]
-    nodes[0]["extras"] = {"colours": {"field": label, "unit": unit, "range": [0.0, top], "colour_map": COLOUR_MAP}}
+    colours = {"field": SHOWN[show].name, "unit": SHOWN[show].unit, "range": [0.0, top], "colour_map": COLOUR_MAP}
+    nodes[0]["extras"] = {"colours": colours}
     content: dict[str, Any] = {"nodes": nodes, "meshes": meshes, "materials": [_material([1.0] * 4)]}
     if len(states) > 1:
         content["animations"] = [_turns(buffer, len(states))]
@@ -204,31 +194,6 @@ def _turns(buffer: _Buffer, count: int) -> dict[str, Any]:
         samplers.append({"input": buffer.add(times), "output": output, "interpolation": "STEP"})
         channels.append({"sampler": i, "target": {"node": i + 1, "path": "scale"}})
     return {"name": "states", "samplers": samplers, "channels": channels}
-
-
-class _Surface:
-    """The surface's nodes and what colours them, evaluated there alone."""
-
-    def __init__(self, model: ReducedModel, used: NDArray[np.int64], show: Colours) -> None:
-        def at_nodes(field: Any) -> Any:
-            return field.restrict(used[:, None], np.ones((len(used), 1)))
-
-        self.rest, self._show = model.nodes[used], show
-        self._displacement = at_nodes(model.displacement)
-        self._stresses = [at_nodes(field) for field in model.stresses.values()] if show == "stress" else []
-        self._strain = at_nodes(model.strain) if show == "strain" else None
-
-    def positions(self, mu: Array) -> Array:
-        """Deformed nodes (n, 3), metres."""
-        return self.rest + self._displacement.value(mu)
-
-    def values(self, mu: Array) -> Array:
-        """What colours the nodes (n,), in the unit of its label; for sheets the larger one of both faces."""
-        if self._show == "stress":
-            return 1e-6 * np.max([von_mises(field.value(mu)) for field in self._stresses], axis=0)
-        if self._strain is not None:
-            return 100.0 * equivalent_strain(self._strain.value(mu))
-        return 1e3 * np.linalg.norm(self._displacement.value(mu), axis=1)
 
 
 def _linear_colours(shares: Array) -> NDArray[np.uint16]:

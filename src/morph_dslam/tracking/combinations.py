@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from morph_dslam.errors import TrackingError
+from morph_dslam.model.shown_field import shown_field
 from morph_dslam.registration.registration import Registration
 from morph_dslam.streams.destinations import check_destination
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
-from morph_dslam.tracking.shown_field import shown_field
 
 
 def _n_starts(part: ObjectOptions) -> int:

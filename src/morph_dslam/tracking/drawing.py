@@ -20,6 +20,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints
+from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import Frame, FrameSource
@@ -30,7 +31,6 @@ from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.force_arrows import ForceArrows
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 
 Array = NDArray[np.float64]
 #: A hexahedron as six tetrahedra around its diagonal 0-6, corners in VTK's order.

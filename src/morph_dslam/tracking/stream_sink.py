@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import StreamError
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 from morph_dslam.streams.destinations import open_destination
 from morph_dslam.streams.messages import (
     FrameMessage,
@@ -30,7 +31,6 @@ from morph_dslam.tracking.displacement_jumps import near_jumps
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.reactions import Reactions
 from morph_dslam.tracking.result import FrameResult
-from morph_dslam.tracking.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 from morph_dslam.tracking.sinks import TrackedFrame
 from morph_dslam.units import FACTORS
 

@@ -16,6 +16,7 @@ import numpy as np
 from morph_dslam.errors import SourceError
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.model.shown_field import Shown
 from morph_dslam.notices import Remark
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
@@ -47,7 +48,6 @@ from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session, SynchronizedFrames
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
-from morph_dslam.tracking.shown_field import Shown
 from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
 from morph_dslam.tracking.still_run import Sharpening, known_state, with_pose, with_still_pose
 from morph_dslam.tracking.stream_sink import StreamedObject, StreamSink

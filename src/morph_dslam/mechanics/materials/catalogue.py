@@ -50,9 +50,9 @@ _CATALOGUE: tuple[CataloguedMaterial, ...] = (
         section={"law": "st_venant_kirchhoff", "young": "5.32 GPa", "poisson": 0.3},
         source="tensile tests of strips, supplement of a study of self-folding corrugated paper, "
         "yvm2020.authorea.com/users/450520/articles/549430",
-        note="Tension up to 0.25 % strain, in one direction, which is not stated. Paper is about half as stiff across the "
-        "machine's direction as along it. Poisson's ratio chosen. Thin sheets are better solved as shells, with the same "
-        "two constants.",
+        note="Tension up to 0.25 % strain, in one direction, which is not stated. Paper is about half as stiff across "
+        "the machine's direction as along it. Poisson's ratio chosen. Thin sheets are better solved as shells, with "
+        "the same two constants.",
     ),
     CataloguedMaterial(
         name="natural_rubber",

@@ -1,4 +1,4 @@
-"""The field that colours an object in pictures and streams: stress, strain, displacement, or the traction of loads."""
+"""The field that colours an object in pictures, streams and exports: stress, strain, displacement, or tractions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import TrackingError
-from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.model.reduced_model import MaterialPoints, equivalent_strain, von_mises
+from morph_dslam.errors import ParameterError
+from morph_dslam.model.reduced_model import MaterialPoints, ReducedModel, equivalent_strain, von_mises
+from morph_dslam.model.separated import SeparatedField
 
 Array = NDArray[np.float64]
 Shown = Literal["stress", "strain", "displacement", "traction"]
@@ -118,7 +118,7 @@ def surface_points(model: ReducedModel) -> tuple[MaterialPoints, NDArray[np.int6
 
 
 def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
-    """What colours an object, by default the stress of a model that has it; raises TrackingError if it has it not."""
+    """What colours an object, by default the stress of a model that has it; raises ParameterError if it has it not."""
     has = {
         "stress": bool(model.stresses),
         "strain": model.strain is not None,
@@ -129,7 +129,7 @@ def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
         return "stress" if has["stress"] else "displacement"
     if not has[show]:
         held = ", ".join(name for name, held in has.items() if held)
-        raise TrackingError(f"the model '{model.name}' holds no {show} to show; it has: {held}")
+        raise ParameterError(f"the model '{model.name}' holds no {show} to show (--show); it has: {held}")
     return show
 
 
