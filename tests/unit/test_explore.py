@@ -17,7 +17,7 @@ import morph_dslam as md
 from morph_dslam.errors import ExploreError
 from morph_dslam.explorer.server import make_server
 from morph_dslam.extend.studies import build_rigid
-from morph_dslam.io.local_server import HOST
+from morph_dslam.io.access import HOST
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
@@ -153,7 +153,7 @@ def test_the_page_is_whole_and_nothing_else_is_served(serve):
 def test_only_this_computer_is_answered(serve):
     assert HOST == "127.0.0.1"
     get = serve(stretched_block_model())
-    for host, status in (("localhost:8765", 200), ("127.0.0.1", 200), ("example.org:8765", 403)):
+    for host, status in (("localhost:8765", 200), ("127.0.0.1", 200), ("example.org:8765", 403), ("[", 403)):
         assert get("/model.json", host=host)[0] == status
 
 

@@ -6,11 +6,11 @@ import sys
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from urllib.parse import urlsplit
 
 from morph_dslam.errors import MorphError
+from morph_dslam.io.access import HOST, ServerNames
 
-HOST = "127.0.0.1"
+_NAMES = ServerNames()
 
 
 class LocalHandler(BaseHTTPRequestHandler):
@@ -21,8 +21,7 @@ class LocalHandler(BaseHTTPRequestHandler):
         raise NotImplementedError
 
     def do_GET(self) -> None:
-        # Else a page from elsewhere could look on under a name of its own for this address.
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname in (HOST, "localhost"):
+        if _NAMES.refusal(self.headers.get("Host", ""), None) is None:
             self.answer()
         else:
             self.send_error(HTTPStatus.FORBIDDEN)

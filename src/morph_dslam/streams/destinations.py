@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from morph_dslam.errors import StreamError
-from morph_dslam.io.local_server import HOST
+from morph_dslam.io.access import HOST
 from morph_dslam.streams.messages import Publisher
 
 DEFAULT_PORT = 8767

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hmac
-import ipaddress
 import os
-import secrets
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -13,7 +10,7 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 from morph_dslam.errors import StreamError
-from morph_dslam.io.local_server import HOST
+from morph_dslam.io.access import HOST, ServerNames, new_token, same_token
 
 #: An environment variable that keeps the token from run to run.
 TOKEN_VARIABLE = "MORPH_STREAM_TOKEN"
@@ -31,7 +28,7 @@ def stream_token() -> str:
     """
     given = os.environ.get(TOKEN_VARIABLE)
     if given is None:
-        return secrets.token_urlsafe(24)
+        return new_token()
     if len(given) < SHORTEST_TOKEN or not given.replace("-", "").replace("_", "").isalnum() or not given.isascii():
         raise StreamError(
             f"{TOKEN_VARIABLE} must be {SHORTEST_TOKEN} or more letters, digits, '-' or '_': "
@@ -66,19 +63,15 @@ class StreamGate:
     """
 
     def __init__(self, token: str, host: str, port: int, names: Iterable[str] = ()) -> None:
-        self._token, self._is_local = token, host == HOST
-        self._names = {HOST, "localhost", *names}
+        self._token, self._names = token, ServerNames(names, any_address=host != HOST)
         self.cookie = f"morph_stream_{port}"
 
     def refusal(self, path: str, headers: Mapping[str, str]) -> Refusal | None:
         """Why a request with these headers is refused; None if it is not."""
-        host, origin = headers.get("Host", ""), headers.get("Origin")
-        # Else a page from elsewhere could look on under a name of its own for this address.
-        if not self._is_known(host):
-            return Refusal(HTTPStatus.FORBIDDEN, "this server is not known by that name")
-        if origin is not None and origin != f"http://{host}":
-            return Refusal(HTTPStatus.FORBIDDEN, "pages from elsewhere are not answered")
-        if not (self.has_token(path) or self._is(self._cookie_of(headers))):
+        refusal = self._names.refusal(headers.get("Host", ""), headers.get("Origin"))
+        if refusal is not None:
+            return Refusal(HTTPStatus.FORBIDDEN, refusal)
+        if not (self.has_token(path) or same_token(self._cookie_of(headers), self._token)):
             return Refusal(
                 HTTPStatus.UNAUTHORIZED, "open the address that `morph` printed: it carries the token (?token=...)"
             )
@@ -86,10 +79,7 @@ class StreamGate:
 
     def has_token(self, path: str) -> bool:
         """Whether an address carries the token."""
-        return self._is(parse_qs(urlsplit(path).query).get("token", [""])[-1])
-
-    def _is(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(errors="replace"), self._token.encode())
+        return same_token(parse_qs(urlsplit(path).query).get("token", [""])[-1], self._token)
 
     def _cookie_of(self, headers: Mapping[str, str]) -> str:
         try:
@@ -97,16 +87,3 @@ class StreamGate:
         except CookieError:
             return ""
         return "" if found is None else found.value
-
-    def _is_known(self, host: str) -> bool:
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:  # brackets that close nothing
-            return False
-        if name in self._names:
-            return True
-        try:
-            ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return not self._is_local  # an address is no name that another site could take for its own

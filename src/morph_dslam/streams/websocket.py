@@ -24,7 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from morph_dslam.errors import StreamError
-from morph_dslam.io.local_server import HOST
+from morph_dslam.io.access import HOST
 from morph_dslam.streams.colours import colour_map
 from morph_dslam.streams.gate import StreamGate, stream_token
 from morph_dslam.streams.messages import FrameMessage, SceneMessage

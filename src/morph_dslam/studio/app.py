@@ -21,8 +21,9 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from morph_dslam.errors import StudioError
+from morph_dslam.io.access import ServerNames
 from morph_dslam.studio import project as names
-from morph_dslam.studio.gate import ANY_ADDRESS, MOST_BODY, Access, Gate
+from morph_dslam.studio.gate import MOST_BODY, Access, Gate
 from morph_dslam.studio.phone import qr_code
 from morph_dslam.studio.steps import Steps
 
@@ -249,13 +250,13 @@ def phone_app(steps: Steps, access: Access) -> Callable:
         Route("/{name:path}", answers.phone_page),
     ]
     application = Starlette(routes=routes, exception_handlers=_HANDLERS)  # type: ignore[arg-type]
-    return Gate(application, access, (ANY_ADDRESS,), _policy())
+    return Gate(application, access, ServerNames(any_address=True), _policy())
 
 
 def make_app(
     steps: Steps,
     access: Access,
-    hosts: tuple[str, ...] = (),
+    server_names: ServerNames,
     beside: Callable[[], AbstractAsyncContextManager] = nullcontext,
 ) -> Callable:
     """The studio of a project as an ASGI application, behind its gate.
@@ -264,7 +265,7 @@ def make_app(
     ----------
     steps : of the project.
     access : of browsers.
-    hosts : names that the server is asked by, beside those of this computer.
+    server_names : that the server may be asked by.
     beside : what runs as long as the application does.
     """
     answers = _Answers(steps)
@@ -292,4 +293,4 @@ def make_app(
         Route("/{name:path}", answers.page),
     ]
     application = Starlette(routes=routes, lifespan=lifespan, exception_handlers=_HANDLERS)  # type: ignore[arg-type]
-    return Gate(application, access, hosts, _policy())
+    return Gate(application, access, server_names, _policy())

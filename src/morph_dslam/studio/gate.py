@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import hmac
-import ipaddress
-import secrets
-from collections.abc import Iterable
 from dataclasses import dataclass
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, QueryParams
 from starlette.requests import cookie_parser
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from morph_dslam.io.local_server import HOST
+from morph_dslam.io.access import ServerNames, new_token, same_token
 
 _COOKIE = "morph_studio"
 _SAFE = ("GET", "HEAD")
 #: Scheme of the pages that may open a WebSocket.
 _SCHEMES = {"ws": "http", "wss": "https"}
-#: Among the hosts: the server may be asked by any numeric address.
-ANY_ADDRESS = "address"
 #: Bytes of a request that is no upload.
 MOST_BODY = 4_000_000
-
-
-def new_token() -> str:
-    """A token that cannot be guessed."""
-    return secrets.token_urlsafe(24)
 
 
 @dataclass
@@ -53,14 +41,14 @@ class Access:
 
     def takes(self, given: str) -> bool:
         """Whether this is the invitation."""
-        accepted = hmac.compare_digest(given.encode(), self.invitation.encode())
+        accepted = same_token(given, self.invitation)
         if accepted and self.once:
             self.invitation = new_token()
         return accepted
 
     def knows(self, given: str) -> bool:
         """Whether this is the session's token."""
-        return hmac.compare_digest(given.encode(), self.session.encode())
+        return same_token(given, self.session)
 
 
 class Gate:
@@ -74,13 +62,12 @@ class Gate:
     ----------
     application : behind the gate.
     access : what is asked for.
-    hosts : names that the server is asked by, beside those of this computer; may hold `ANY_ADDRESS`.
+    names : that the server may be asked by.
     policy : Content-Security-Policy of all answers that have none of their own.
     """
 
-    def __init__(self, application: ASGIApp, access: Access, hosts: Iterable[str], policy: str) -> None:
-        self._application, self._access, self._policy = application, access, policy
-        self._hosts = {HOST, "localhost", *hosts}
+    def __init__(self, application: ASGIApp, access: Access, names: ServerNames, policy: str) -> None:
+        self._application, self._access, self._names, self._policy = application, access, names, policy
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it."""
@@ -98,11 +85,10 @@ class Gate:
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers, query = Headers(scope=scope), QueryParams(scope.get("query_string", b""))
-        if not self._is_known(_hostname(f"//{headers.get('host', '')}")):
-            return PlainTextResponse("this server is not known by that name", 403)
         origin = headers.get("origin")
-        if origin is not None and origin != f"{scope['scheme']}://{headers['host']}":
-            return PlainTextResponse("pages from elsewhere are not answered", 403)
+        refusal = self._names.refusal(headers.get("host", ""), origin, scope["scheme"])
+        if refusal is not None:
+            return PlainTextResponse(refusal, 403)
         given, cookie = query.get("token"), f"{_COOKIE}_{headers['host'].rpartition(':')[2]}"
         if given is not None and scope["path"] == "/" and scope["method"] in _SAFE and self._access.takes(given):
             answer = RedirectResponse("/", 303)
@@ -114,9 +100,6 @@ class Gate:
         if scope["method"] not in _SAFE and origin is None:
             return PlainTextResponse("a change must come from the studio's own page", 403)
         return None
-
-    def _is_known(self, host: str | None) -> bool:
-        return host in self._hosts or (ANY_ADDRESS in self._hosts and _is_address(host or ""))
 
     def _with_headers(self, send: Send) -> Send:
         async def guarded(message: Message) -> None:
@@ -139,18 +122,3 @@ async def _refuse(receive: Receive, send: Send) -> None:
     """Refuse a WebSocket before it is opened: the browser gets status 403."""
     await receive()
     await send({"type": "websocket.close", "code": 1008})
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
-
-
-def _hostname(address: str) -> str | None:
-    try:
-        return urlsplit(address).hostname
-    except ValueError:  # brackets that close nothing
-        return None

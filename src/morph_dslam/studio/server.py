@@ -14,9 +14,9 @@ from types import FrameType
 import uvicorn
 
 from morph_dslam.errors import StudioError
-from morph_dslam.io.local_server import HOST
+from morph_dslam.io.access import HOST, ServerNames, new_token
 from morph_dslam.studio.app import make_app, phone_app
-from morph_dslam.studio.gate import ANY_ADDRESS, Access, new_token
+from morph_dslam.studio.gate import Access
 from morph_dslam.studio.live import WEBSOCKETS
 from morph_dslam.studio.phone import PhoneServer, own_address
 from morph_dslam.studio.project import Project
@@ -49,15 +49,14 @@ class StudioServer:
         project, self.token = Project(folder), new_token()
         self._socket = _listening(host, port)
         self.port = int(self._socket.getsockname()[1])
-        # An address is no name that another site could take for its own.
-        hosts = () if host == HOST else (host, socket.gethostname(), ANY_ADDRESS)
+        names = ServerNames() if host == HOST else ServerNames((host, socket.gethostname()), any_address=True)
         self.phone_access = Access.single() if phone else None
         self._phone_socket = _listening("0.0.0.0", self.port + 1 if port else 0) if phone else None
         self.phone_port = int(self._phone_socket.getsockname()[1]) if self._phone_socket else 0
         self._phone_host = own_address()
         steps = Steps(project, lambda: self.phone_address)
         self._phone_app = phone_app(steps, self.phone_access) if self.phone_access else None
-        application = make_app(steps, Access(self.token, self.token), hosts, self._phones)
+        application = make_app(steps, Access(self.token, self.token), names, self._phones)
         config = uvicorn.Config(
             application, log_level="error", access_log=False, server_header=False, lifespan="on", **WEBSOCKETS,
             timeout_graceful_shutdown=2,
