@@ -8,6 +8,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.registration.registration import Registration
+from morph_dslam.sources import Frame
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.outcomes import RejectionReason
@@ -160,6 +161,41 @@ def test_object_absent_from_the_beginning_is_waited_for(model, film):
     result = tracker.track(film.frame(truth))
     assert result.status == "tracked", result.reason
     assert mean_error(model, result.estimate.state, truth) < 1.5e-3
+
+
+def jumps(count):
+    """States far from the first one: other shapes, turned by about 20 degrees, moved by about 7 cm."""
+    random = np.random.default_rng(0)
+    for _ in range(count):
+        shape = sheet_state(random.uniform(0.2, 1.0))
+        turn, shift = 0.25 * random.normal(size=3), random.normal(size=3) * [0.05, 0.04, 0.05]
+        pose = shape.camera_from_object
+        moved = RigidTransform(rotation_exp(turn) @ pose.rotation, pose.translation + shift)
+        yield State(shape.parameters, moved)
+
+
+def jumped(model, film, truth, interval):
+    """Results of the frame after the jump and of one more like it, where frames came every 30th of a second."""
+    tracker = start(model, film)
+    for i in range(3):
+        tracker.track(Frame(i, i / 30, film.frame(sheet_state(0.02 * i))))
+    times = 2 / 30 + interval, 3 / 30 + interval
+    return [tracker.track(Frame(3 + i, time, film.frame(truth))) for i, time in enumerate(times)]
+
+
+def test_object_that_moved_in_a_gap_of_the_recording_is_looked_for_anew(model, film):
+    for truth in jumps(5):
+        first, second = jumped(model, film, truth, 3.0)
+        assert first.recovered
+        assert mean_error(model, first.estimate.state, truth) < 2e-3
+        assert mean_error(model, second.estimate.state, truth) < 0.1e-3
+
+
+def test_object_that_was_found_anew_has_no_velocity_yet(model, film):
+    truth = list(jumps(8))[7]
+    first, second = jumped(model, film, truth, 1 / 30)
+    assert first.recovered
+    assert mean_error(model, second.estimate.state, truth) < 0.1e-3
 
 
 def test_second_identical_object_is_not_taken_for_the_first(model, film):

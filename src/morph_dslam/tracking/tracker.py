@@ -25,6 +25,7 @@ from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
+from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.options import TrackerOptions
@@ -144,7 +145,7 @@ class Tracker:
         self._still: Prior | None = None
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
-        self._lost, self._n_lost = not in_sequence, 0
+        self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
         self._jumps_before: tuple[DisplacementJump, ...] = ()
@@ -184,7 +185,7 @@ class Tracker:
                 hypothesis, found_by, rejection = self._relocalize(image, hypothesis, rejection, camera)
             if rejection is None:
                 hypothesis = self._refine(image, hypothesis, camera)
-            self._update(image, hypothesis, rejection, camera)
+            self._update(image, hypothesis, found_by, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
             change = self._choose_view(image, hypothesis, result)
         times = clock.milliseconds | {"locate": camera.milliseconds}
@@ -222,13 +223,15 @@ class Tracker:
     def _prepare(
         self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray[np.float32] | None, ready: Image | None
     ) -> Image:
-        """Undistort and normalize contrast; the first frame is the reference if none was given."""
+        """Undistort and normalize contrast; the first frame is the reference if none was given, a gap is a loss."""
         with stage("prepare"):
             depth = frame.depth if isinstance(frame, Frame) and self.options.use_depth else None
             image = ready or self._prepared(frame.image if isinstance(frame, Frame) else frame)
             image = replace(image, depth=depth, occluder_depth=occluder_depth)
             if self._views is None:
                 self._begin(image)
+            if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
+                self._lost = True
             return image
 
     def _predict(self, camera: CameraLocalization) -> Prior | None:
@@ -329,11 +332,16 @@ class Tracker:
         return hypothesis
 
     def _update(
-        self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection | None, camera: CameraLocalization
+        self,
+        image: Image,
+        hypothesis: PoseHypothesis,
+        found_by: FoundBy,
+        rejection: Rejection | None,
+        camera: CameraLocalization,
     ) -> None:
         """Keep what the next frame starts from; a lost frame keeps the last known shape."""
         if rejection is None:
-            self._learn(image, hypothesis)
+            self._learn(image, hypothesis, found_by is FoundBy.FLOW)
         else:
             self.last_measured = self.reference.nothing_measured
             if self.estimator.loads is not None:
@@ -487,8 +495,8 @@ class Tracker:
             return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
         return np.nan_to_num(last - self.reference.projected(self._velocity_base))
 
-    def _learn(self, image: Image, hypothesis: PoseHypothesis) -> None:
-        """Take in an accepted frame."""
+    def _learn(self, image: Image, hypothesis: PoseHypothesis, is_followed: bool) -> None:
+        """Take in an accepted frame; one in which the object was found anew says nothing of its velocity."""
         estimate, inliers, pixels = hypothesis.estimate, hypothesis.inliers, hypothesis.measurement.pixels
         self.last_seen = None
         if not self._view.number:
@@ -500,7 +508,7 @@ class Tracker:
                 self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
         if self.estimator.loads is not None:
             self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
-        self._velocity_base = estimate.state if self._lost else self._last
+        self._velocity_base = self._last if is_followed else estimate.state
         self._last = estimate.state
         self._start = with_unobservable_at_default(self.model, estimate)
         if self.options.start == "constant-velocity":
@@ -509,7 +517,7 @@ class Tracker:
         self._pixels = np.where(inliers[:, None], pixels, self.reference.projected(self._last))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis, image)
-        if not self._lost:
+        if is_followed:
             self._view.recovery.learn(hypothesis)
 
     def _choose_view(self, image: Image, hypothesis: PoseHypothesis, result: FrameResult) -> Change | None:
