@@ -148,7 +148,7 @@ def filmed(seed: int, variant: str) -> Path:
 def followed(folder: Path, run: Path, refine: bool, video: bool) -> Path:
     """Map, register and track a recording; the camera file that was used."""
     frames, camera = folder / "recording" / "frames", folder / "stated.yaml"
-    terms = ("focal", "centre", "radial", "readout") if refine else ()
+    terms = ("focal", "centre", "radial", "tangential", "readout") if refine else ()
     run_slam(frames, camera, run / "scan", last=SCAN_END, refine=terms, video=False, overwrite=True)
     if refine:
         camera = run / "scan" / "camera.yaml"

@@ -8,10 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
+from morph_dslam.errors import MapError
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.rolling_shutter import RowPoses, correct_path
-from morph_dslam.slam.self_calibration import camera_notes, estimate_camera
+from morph_dslam.slam.scene import refine_camera
+from morph_dslam.slam.self_calibration import TERMS, camera_notes, estimate_camera, with_terms_of
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 LENS = (-0.28, 0.07, 0.0, 0.0)
@@ -88,6 +90,34 @@ def test_a_wrong_camera_is_named_and_a_right_one_is_not(true, given, wrong):
     assert [estimate.camera.cx, estimate.camera.cy] == pytest.approx([319.5, 239.5], abs=6.0)
     assert (estimate.camera.distortion or (0.0, 0.0))[:2] == pytest.approx((true.distortion or LENS[2:])[:2], abs=0.02)
     assert bool(list(camera_notes(estimate))) == bool(wrong)
+
+
+def test_a_lens_whose_elements_are_not_centred_spoils_no_focal_length():
+    true = replace(CAMERA, distortion=(-0.12, 0.04, 0.002, -0.002))
+    given = replace(CAMERA, fx=530.0, fy=530.0, distortion=(-0.1, 0.04, 0.0, 0.0))
+    data = recording(true, given)
+    found, without = (estimate_camera(*data, terms) for terms in (TERMS, ("focal", "centre", "radial")))
+    assert found.terms["tangential"].is_refuted
+    assert found.camera.distortion[2:4] == pytest.approx((0.002, -0.002), abs=0.001)
+    assert found.camera.fx == pytest.approx(525.0, rel=0.004)
+    assert without.camera.fx != pytest.approx(525.0, rel=0.004)
+
+
+def test_one_term_of_another_camera():
+    lens = (-0.12, 0.04, 0.002, -0.001, 0.01)
+    other = replace(CAMERA, fx=530.0, fy=530.0, distortion=lens, readout_s=0.01)
+    assert with_terms_of(CAMERA, other, ("tangential",)).distortion == (0.0, 0.0, 0.002, -0.001, 0.0)
+    assert with_terms_of(CAMERA, other, ("radial",)).distortion == (-0.12, 0.04, 0.0, 0.0, 0.01)
+    assert with_terms_of(other, CAMERA, ("radial", "tangential")).distortion == ()
+    assert with_terms_of(other, CAMERA, ("focal", "readout")) == replace(CAMERA, distortion=lens)
+
+
+def test_a_fisheye_has_no_tangential_terms(tmp_path):
+    fisheye = replace(CAMERA, distortion=(0.0, 0.0, 0.0, 0.0), lens_model="fisheye")
+    assert set(estimate_camera(*recording(CAMERA, fisheye)).terms) == {"focal", "centre", "radial", "readout"}
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    with pytest.raises(MapError, match="fisheye lens has no tangential terms"):
+        refine_camera(tmp_path, fisheye, ("tangential",))
 
 
 def test_deviations_are_those_of_repeated_recordings():

@@ -5,7 +5,7 @@ import argparse
 from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, frame_number
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
-TERMS = ("focal", "centre", "radial", "readout")
+TERMS = ("focal", "centre", "radial", "tangential", "readout")
 KEPT = "the frames tracked so far and their map are kept in the run folder"
 
 
@@ -48,8 +48,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         nargs="?",
         const="all",
         choices=(*TERMS, "all"),
-        help="estimate the focal length, the principal point, radial terms of the lens, the readout time of a rolling "
-        "shutter, or all of them first, and write camera.yaml into the run folder; may be repeated",
+        help="estimate the focal length, the principal point, radial or tangential terms of the lens, the readout time "
+        "of a rolling shutter, or all of them first, and write camera.yaml into the run folder; may be repeated",
     )
     add_flag(command, "--no-depth", "leave the depth images of the recording aside")
     add_flag(command, "--overwrite", "replace a run that is in the run folder")

@@ -34,6 +34,7 @@ from morph_dslam.slam.self_calibration import (
     TermEstimate,
     camera_notes,
     estimate_camera,
+    terms_of,
     with_terms_of,
 )
 from morph_dslam.slam.slam import Slam
@@ -262,11 +263,13 @@ def refine_camera(
     options : of the maps
     progress : whether to show bars
 
-    Raises MapError if the recording gives too small a map.
+    Raises MapError if the recording gives too small a map, or the camera has none of the terms.
     """
     opened = open_source(source) if isinstance(source, str | Path) else source
     terms_found, refined = dict[CameraTerm, TermEstimate](), camera
-    free: list[CameraTerm] = list(terms)
+    free: list[CameraTerm] = terms_of(camera, terms)
+    if not free:
+        raise MapError("a fisheye lens has no tangential terms: leave out --refine-camera tangential")
     for number in range(REFINING_RUNS):
         scene = map_scene(opened, refined, options, progress)
         estimate = _estimated(scene, free, opened.name)
@@ -278,7 +281,7 @@ def refine_camera(
             estimate = _estimated(scene, free, opened.name)
             _take_in(terms_found, estimate)
         hidden: list[CameraTerm] = [term for term in free if not estimate.terms[term].is_observable]
-        free = [term for term in free if term not in hidden]
+        free = terms_of(camera, [term for term in free if term not in hidden])
         refined = with_terms_of(with_terms_of(refined, estimate.camera, free), camera, hidden)
         if not free:
             break

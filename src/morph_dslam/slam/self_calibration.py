@@ -27,13 +27,16 @@ from morph_dslam.threads import one_thread_for_algebra
 
 Array = NDArray[np.float64]
 #: What can be estimated of a camera.
-CameraTerm = Literal["focal", "centre", "radial", "readout"]
+CameraTerm = Literal["focal", "centre", "radial", "tangential", "readout"]
 TERMS: tuple[CameraTerm, ...] = get_args(CameraTerm)
-#: Unknowns of each term: logarithm of the focal length, principal point in pixels, k1 and k2, seconds.
-COLUMNS: dict[CameraTerm, list[int]] = {"focal": [0], "centre": [1, 2], "radial": [3, 4], "readout": [5]}
-N_UNKNOWNS = 6
+#: Unknowns of each term: logarithm of the focal length, principal point in pixels, k1 and k2, p1 and p2, seconds.
+COLUMNS: dict[CameraTerm, list[int]] = {
+    "focal": [0], "centre": [1, 2], "radial": [3, 4], "tangential": [5, 6], "readout": [7],
+}  # fmt: skip
+N_UNKNOWNS = 8
 #: Standard deviations of the unknowns before anything is measured, the principal point's in image widths.
-PRIOR_STD = np.array([0.3, 0.1, 0.1, 0.3, 0.3, 0.03])
+#: Elements of a lens are centred so well that p1 and p2 of a calibration are seldom above two thousandths.
+PRIOR_STD = np.array([0.3, 0.1, 0.1, 0.3, 0.3, 0.002, 0.002, 0.03])
 #: Frames and points that are adjusted, spread over the recording and the most often seen; the fewest that say anything.
 MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 30, 800, 8, 40
 #: A point counts from so many frames on, a frame from so many of these points on; and the share of the frames chosen
@@ -44,12 +47,12 @@ ROUNDS, ITERATIONS, LEAST_GAIN = 3, 15, 1e-4
 #: Width of the Huber cost while poses and points are fitted to another camera.
 START_HUBER_PX = 20.0
 #: Steps of the numerical derivatives: of a point, in depths, and of the camera's unknowns.
-POINT_STEP, CAMERA_STEPS = 1e-5, np.array([1e-6, 1e-3, 1e-3, 1e-6, 1e-6])
+POINT_STEP, CAMERA_STEPS = 1e-5, np.array([1e-6, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6])
 #: A departure is named if it exceeds so many standard deviations and matters: as a part of the focal length; of half
 #: the image's diagonal, for the principal point and for the lens (root mean square over the image); in pixels that
 #: the points move by, for the readout time.
 SIGNIFICANT = 3.0
-MATTERS: dict[CameraTerm, float] = {"focal": 0.03, "centre": 0.03, "radial": 0.02, "readout": 0.5}
+MATTERS: dict[CameraTerm, float] = {"focal": 0.03, "centre": 0.03, "radial": 0.02, "tangential": 0.02, "readout": 0.5}
 #: A term is unobservable if two deviations exceed so many times what matters.
 UNOBSERVABLE = 3.0
 
@@ -60,7 +63,7 @@ class TermEstimate:
 
     Attributes
     ----------
-    given, estimated, std : of its values: fx in pixels, (cx, cy) in pixels, (k1, k2), seconds
+    given, estimated, std : of its values: fx in pixels, (cx, cy) in pixels, (k1, k2), (p1, p2), seconds
     departure, departure_std : between both, as a part of the focal length, in pixels of the principal point, in pixels
         of the lens (root mean square over the image), in pixels that points move by while the image is read out
     matters : from where on a departure matters, in the same unit
@@ -109,12 +112,12 @@ class CameraEstimate:
 
 
 def changed(camera: Camera, unknowns: Array) -> Camera:
-    """The camera with its unknowns (6,) changed by so much."""
+    """The camera with its unknowns (8,) changed by so much."""
     factor, distortion = float(np.exp(unknowns[0])), camera.distortion
-    if unknowns[3:5].any():
-        first, second, *others = distortion or (0.0,) * 4
-        distortion = (first + float(unknowns[3]), second + float(unknowns[4]), *others)
-    readout = float(np.clip(camera.readout_s + unknowns[5], -LONGEST_READOUT_S, LONGEST_READOUT_S))
+    if unknowns[3:7].any():
+        given = distortion or (0.0,) * 4
+        distortion = (*(value + float(change) for value, change in zip(given, unknowns[3:7], strict=False)), *given[4:])
+    readout = float(np.clip(camera.readout_s + unknowns[7], -LONGEST_READOUT_S, LONGEST_READOUT_S))
     return replace(
         camera,
         fx=factor * camera.fx,
@@ -126,10 +129,30 @@ def changed(camera: Camera, unknowns: Array) -> Camera:
     )
 
 
+def terms_of(camera: Camera, terms: Sequence[CameraTerm] = TERMS) -> list[CameraTerm]:
+    """Those of the terms that a camera has: a fisheye has no tangential ones."""
+    return [term for term in terms if term != "tangential" or camera.lens_model == "radial-tangential"]
+
+
 def with_terms_of(camera: Camera, other: Camera, terms: Sequence[CameraTerm]) -> Camera:
     """The camera with some terms of another one."""
-    fields = {"focal": ("fx", "fy"), "centre": ("cx", "cy"), "radial": ("distortion",), "readout": ("readout_s",)}
-    return replace(camera, **{name: getattr(other, name) for term in terms for name in fields[term]})
+    fields = {"focal": ("fx", "fy"), "centre": ("cx", "cy"), "readout": ("readout_s",)}
+    result = replace(camera, **{name: getattr(other, name) for term in terms for name in fields.get(term, ())})
+    return replace(result, distortion=_lens_of(camera.distortion, other.distortion, terms))
+
+
+def _lens_of(own: tuple[float, ...], other: tuple[float, ...], terms: Sequence[CameraTerm]) -> tuple[float, ...]:
+    """Coefficients with some terms of another lens; a lens without coefficients has zeros."""
+    count = max(len(own), len(other), 4)
+    pairs = zip(*(lens + (0.0,) * (count - len(lens)) for lens in (own, other)), strict=True)
+    mixed = tuple(theirs if _term_of(k) in terms else mine for k, (mine, theirs) in enumerate(pairs))
+    same = (lens for lens in (own, other) if mixed == lens + (0.0,) * (count - len(lens)))
+    return next(same, mixed)
+
+
+def _term_of(coefficient: int) -> CameraTerm:
+    """The term that a coefficient of a radial-tangential lens belongs to."""
+    return "tangential" if coefficient in (2, 3) else "radial"
 
 
 @dataclass
@@ -171,7 +194,7 @@ class _Views:
         return replace(self, poses=poses, points=self.points + point_steps)
 
     def derivatives(self, given: Camera, unknowns: Array) -> tuple[Array, Array, Array]:
-        """Of the residuals by pose twists (o, 2, 6), points (o, 2, 3) and the camera's unknowns (o, 2, 6)."""
+        """Of the residuals by pose twists (o, 2, 6), points (o, 2, 3) and the camera's unknowns (o, 2, 8)."""
         camera, twists, local = changed(given, unknowns), self.twists[self.frame_idx], self.local()
         times = row_times(self.recorded[:, 1], camera)
         seen = after(local, twists, camera.readout_s * times)
@@ -193,7 +216,7 @@ class _Views:
             upper, lower = changed(given, unknowns + change), changed(given, unknowns - change)
             by_camera[:, :, column] = (upper.project_recorded(seen) - lower.project_recorded(seen)) / (2.0 * step)
         velocity = np.cross(twists[:, :3], seen) + twists[:, 3:]
-        by_camera[:, :, 5] = np.einsum("oij,oj->oi", by_seen, velocity) * times[:, None]
+        by_camera[:, :, 7] = np.einsum("oij,oj->oi", by_seen, velocity) * times[:, None]
         return np.nan_to_num(by_pose), np.nan_to_num(by_point), np.nan_to_num(by_camera)
 
 
@@ -281,7 +304,7 @@ class _Normal:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Views, the camera's unknowns (6,), the covariance (s, s) of those that were free, and the cost, px^2."""
+    """Views, the camera's unknowns (8,), the covariance (s, s) of those that were free, and the cost, px^2."""
 
     views: _Views
     unknowns: Array
@@ -402,8 +425,9 @@ def estimate_camera(
     rigid_map : made with ``camera``
     path : of the camera
     seen : the map points in each of its frames
-    terms : to estimate; the others stay
+    terms : to estimate; the others stay, and a fisheye has no tangential ones
     """
+    terms = terms_of(camera, terms)
     recording = _Recording(rigid_map, camera, path, seen)
     if not recording.is_enough:
         return None
@@ -440,7 +464,7 @@ def _estimate(camera: Camera, solution: _Solution, free: Indices, terms: Sequenc
     for term in terms:
         columns, directions = COLUMNS[term], effects[term]
         part = covariance[np.ix_(columns, columns)]
-        matters = MATTERS[term] * (half_diagonal if term in ("centre", "radial") else 1.0)
+        matters = MATTERS[term] * (half_diagonal if term in ("centre", "radial", "tangential") else 1.0)
         estimates[term] = TermEstimate(
             _values(camera, term),
             _values(found, term),
@@ -453,11 +477,12 @@ def _estimate(camera: Camera, solution: _Solution, free: Indices, terms: Sequenc
 
 
 def _values(camera: Camera, term: CameraTerm) -> tuple[float, ...]:
-    first, second, *_ = camera.distortion or (0.0, 0.0)
+    k1, k2, p1, p2, *_ = camera.distortion or (0.0,) * 4
     values: dict[CameraTerm, tuple[float, ...]] = {
         "focal": (camera.fx,),
         "centre": (camera.cx, camera.cy),
-        "radial": (first, second),
+        "radial": (k1, k2),
+        "tangential": (p1, p2),
         "readout": (camera.readout_s,),
     }
     return values[term]
@@ -471,13 +496,15 @@ def _effects(camera: Camera, views: _Views) -> dict[CameraTerm, Array]:
     steps = [step * np.eye(N_UNKNOWNS)[k] for k, step in enumerate(CAMERA_STEPS)]
     by_lens = [
         (changed(camera, steps[k]).project_recorded(rays) - camera.project_recorded(rays)).ravel() / CAMERA_STEPS[k]
-        for k in COLUMNS["radial"]
+        for k in (*COLUMNS["radial"], *COLUMNS["tangential"])
     ]
-    by_readout = views.derivatives(camera, np.zeros(N_UNKNOWNS))[2][:, :, 5]
+    radial, tangential = np.hsplit(np.column_stack(by_lens) / np.sqrt(len(rays)), 2)
+    by_readout = views.derivatives(camera, np.zeros(N_UNKNOWNS))[2][:, :, 7]
     return {
         "focal": np.eye(1),
         "centre": np.eye(2),
-        "radial": np.column_stack(by_lens) / np.sqrt(len(rays)),
+        "radial": radial,
+        "tangential": tangential,
         "readout": by_readout.reshape(-1, 1) / np.sqrt(len(by_readout)),
     }
 
@@ -508,6 +535,7 @@ _NAMES: dict[CameraTerm, str] = {
     "focal": "focal length",
     "centre": "principal point",
     "radial": "lens distortion k1, k2",
+    "tangential": "lens distortion p1, p2",
     "readout": "readout_s",
 }
 
