@@ -71,6 +71,15 @@ def ogden(F, moduli, exponents, bulk):
     return F @ (axes * (beta / squares)) @ axes.T + volumetric(F, bulk)
 
 
+def hyperfoam(F, moduli, exponents, poissons):
+    """By principal stretches, as `ogden`."""
+    squares, axes = np.linalg.eigh(F.T @ F)
+    stretches, J = np.sqrt(squares), np.linalg.det(F)
+    terms = zip(moduli, exponents, poissons, strict=True)
+    beta = sum(2 * m / a * (stretches**a - J ** (-a * n / (1 - 2 * n))) for m, a, n in terms)
+    return F @ (axes * (beta / squares)) @ axes.T
+
+
 def orthotropic_stiffness(e, n, g):
     """(6, 6) in Voigt's order 11, 22, 33, 23, 13, 12 from e_1..3, n_12, n_13, n_23 and g_12, g_13, g_23."""
     compliance = np.zeros((6, 6))

@@ -11,6 +11,7 @@ from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Or
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.materials.isotropic import (
     Gent,
+    Hyperfoam,
     LinearElastic,
     MooneyRivlin,
     NeoHookean,
@@ -81,6 +82,10 @@ LAWS = {
     "ogden": (
         Ogden(moduli=MODULI, exponents=EXPONENTS, bulk=7.0),
         partial(exact.ogden, moduli=MODULI, exponents=EXPONENTS, bulk=7.0),
+    ),
+    "hyperfoam": (
+        Hyperfoam(moduli=(0.4, 0.1), exponents=(-2.0, 5.0), poissons=(0.25, 0.0)),
+        partial(exact.hyperfoam, moduli=(0.4, 0.1), exponents=(-2.0, 5.0), poissons=(0.25, 0.0)),
     ),
     "orthotropic": (
         orthotropic(axis_1=tuple(AXES[:, 0]), axis_2=tuple(AXES[:, 1] + 0.3 * AXES[:, 0])),

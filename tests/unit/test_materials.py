@@ -11,6 +11,7 @@ from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Tr
 from morph_dslam.mechanics.materials.base import evaluate, isotropic_average
 from morph_dslam.mechanics.materials.isotropic import (
     Gent,
+    Hyperfoam,
     LinearElastic,
     MooneyRivlin,
     NeoHookean,
@@ -101,6 +102,7 @@ def test_the_energy_is_its_remainder_and_the_volumetric_part(name):
         ("yeoh", 7.0, 0.8),
         ("gent", 7.0, 0.8),
         ("ogden", 7.0, 0.35),
+        ("hyperfoam", 2.0 * (0.4 * (1.0 / 3.0 + 0.5) + 0.1 / 3.0), 0.5),
         ("user_material", 7.0, 0.84),
     ],
 )
@@ -162,6 +164,23 @@ def test_ogdens_exponents_may_be_parameters():
     assert slope == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-7)
 
 
+@pytest.mark.parametrize("stretch", [0.5, 1.0, 1.6])
+def test_the_foam_of_blatz_and_ko(stretch):
+    """Pulled freely, P = mu (l^(-1/2) - l^-3), and the foam narrows by l^(-1/4) (Trans. Soc. Rheol. 6, 1962)."""
+    foam = Hyperfoam(moduli=(0.22,), exponents=(-2.0,), poissons=(0.25,))
+    found = stress(foam, np.diag([stretch, stretch**-0.25, stretch**-0.25]))
+    expected = np.diag([0.22 * (stretch**-0.5 - stretch**-3), 0.0, 0.0])
+    np.testing.assert_allclose(found, expected, atol=1e-13)
+
+
+def test_poissons_ratio_of_a_foam_may_be_a_parameter_that_passes_zero():
+    poisson, h = ngs.Parameter(0.0), 1e-5
+    foam = Hyperfoam(moduli=(1.0,), exponents=(4.0,), poissons=(poisson,))
+    slope = evaluate(foam.energy(tensor(BULGED)).Diff(poisson))
+    ends = [energy(Hyperfoam(moduli=(1.0,), exponents=(4.0,), poissons=(s,)), BULGED) for s in (-h, h)]
+    assert slope == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-7)
+
+
 def test_a_fibre_turned_by_a_parameter_is_the_fibre_at_that_angle():
     angle = ngs.Parameter(0.0)
     turned = turned_direction(angle, (2.0, 0.0, 0.0), (1.0, 1.0, 0.0))
@@ -210,6 +229,10 @@ HGO = {"shear": 0.5, "k1": 1.3, "k2": 0.7, "bulk": 7.0}
         (Ogden(moduli=(0.1, -0.3), exponents=(2.0, 4.0), bulk=7.0), "ogden is unstable"),
         (Ogden(moduli=(0.1,), exponents=(2.0, 4.0), bulk=7.0), "there are 1 and 2"),
         (Ogden(moduli=(0.1,), exponents=(0.0,), bulk=7.0), "exponent of 0"),
+        (Hyperfoam(moduli=(0.1,), exponents=(2.0,), poissons=(0.2, 0.3)), "there are 1 and 1 and 2"),
+        (Hyperfoam(moduli=(0.1,), exponents=(2.0,), poissons=(0.5,)), "between -1/3 and 0.5, but one is 0.5"),
+        (Hyperfoam(moduli=(0.1,), exponents=(0.0,), poissons=(0.2,)), "hyperfoam: an exponent of 0"),
+        (Hyperfoam(moduli=(-0.1,), exponents=(2.0,), poissons=(0.2,)), "hyperfoam is unstable"),
         (Ogden(moduli=(float("inf"),), exponents=(2.0,), bulk=7.0), r"moduli\[0\] is not a finite"),
         (orthotropic(shear_13=-1.2), "shear_13 = -1.2 must be positive"),
         (orthotropic(poisson_12=1.6), "poisson_12 = 1.6, .* are unstable"),

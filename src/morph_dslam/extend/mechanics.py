@@ -32,6 +32,7 @@ from morph_dslam.mechanics.materials.catalogue import (
 )
 from morph_dslam.mechanics.materials.isotropic import (
     Gent as Gent,
+    Hyperfoam as Hyperfoam,
     LinearElastic as LinearElastic,
     MooneyRivlin as MooneyRivlin,
     NeoHookean as NeoHookean,

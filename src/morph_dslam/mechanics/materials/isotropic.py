@@ -227,6 +227,9 @@ _NEARLY_PAIRED = 1e-3
 #: Terms that bring the series to double precision at those bounds.
 _SPHERICAL_TERMS = 10
 _PAIR_TERMS = 5
+#: Where the series of (exp(x) - 1) / x takes over, and its terms.
+_NEARLY_ZERO = 0.05
+_EXPONENTIAL_TERMS = 10
 #: Newton steps from a straight line to double precision of a root and its second derivative.
 _ROOT_STEPS = 5
 
@@ -344,16 +347,80 @@ class Ogden(Rubber):
         return energy
 
     def constants(self) -> dict[str, Constant]:
-        lists = {"moduli": self.moduli, "exponents": self.exponents}
-        terms = {f"{name}[{i}]": value for name, values in lists.items() for i, value in enumerate(values)}
-        return super().constants() | terms
+        return super().constants() | _listed(moduli=self.moduli, exponents=self.exponents)
 
     def check_constants(self) -> None:
         super().check_constants()
-        if not len(self.moduli) == len(self.exponents) > 0:
-            raise StudyError(
-                f"{self.name}: moduli and exponents must be lists of one length, "
-                f"but there are {len(self.moduli)} and {len(self.exponents)}"
-            )
-        if any(evaluate(exponent) == 0.0 for exponent in self.exponents):
-            raise StudyError(f"{self.name}: an exponent of 0 leaves its term without stiffness; remove the term")
+        _check_terms(self.name, moduli=self.moduli, exponents=self.exponents)
+
+
+@register_law("hyperfoam")
+class Hyperfoam(Material):
+    """Compressible foam: a sum of powers of the principal stretches, with a volume change of its own for each.
+
+    Energy  W = sum_p 2 mu_p / alpha_p^2 (l1^a + l2^a + l3^a - 3 + (J^(-a b) - 1) / b),  a = alpha_p, b = beta_p
+    Stress  principal: P_i = sum_p 2 mu_p / alpha_p (l_i^(a - 1) - J^(-a b) / l_i)
+    with beta_p = nu_p / (1 - 2 nu_p). Shear modulus sum_p mu_p; a single term has Poisson's ratio nu_1 at small strain.
+
+    Storakers, J. Mech. Phys. Solids 34, 1986; the normalisation is Abaqus's. The foam of Blatz and Ko (Trans. Soc.
+    Rheol. 6, 1962) has one term, alpha = -2 and nu = 1/4.
+
+    Attributes
+    ----------
+    moduli : mu_p, Pa, one for each term.
+    exponents : alpha_p, none of them zero.
+    poissons : nu_p, above -1/3 and below 1/2.
+    """
+
+    moduli: tuple[Constant, ...]
+    exponents: tuple[Constant, ...]
+    poissons: tuple[Constant, ...]
+    quantities: ClassVar = {"exponents": "ratio", "poissons": "ratio"}
+
+    def parts(self, F: Any) -> tuple[Any, Any]:
+        spectrum, log_J = _Spectrum(right_cauchy_green(F)), log_volume(F)
+        energy: Any = ngs.CF(0.0)
+        for modulus, exponent, poisson in zip(self.moduli, self.exponents, self.poissons, strict=True):
+            beta = poisson / (1.0 - 2.0 * poisson)
+            # (J^(-a b) - 1) / b has a limit where b is zero, as in foams that do not widen when they are pressed.
+            volume = -exponent * log_J * _mean_exponential(-exponent * beta * log_J)
+            energy += 2.0 * modulus / exponent**2 * (spectrum.power_sum(0.5 * exponent) - 3.0 + volume)
+        return energy, None
+
+    def constants(self) -> dict[str, Constant]:
+        lists = _listed(moduli=self.moduli, exponents=self.exponents, poissons=self.poissons)
+        return super().constants() | lists
+
+    def check_constants(self) -> None:
+        _check_terms(self.name, moduli=self.moduli, exponents=self.exponents, poissons=self.poissons)
+        for poisson in map(evaluate, self.poissons):
+            if not -1.0 / 3.0 < poisson < 0.5:
+                raise StudyError(f"{self.name}: poissons must lie between -1/3 and 0.5, but one is {poisson:g}")
+
+
+def _mean_exponential(x: Any) -> Any:
+    """(exp(x) - 1) / x, by its series where x is small."""
+    small = ngs.IfPos(x * x - _NEARLY_ZERO**2, 0.0, x)
+    series: Any = 1.0
+    for k in range(_EXPONENTIAL_TERMS, 1, -1):
+        series = 1.0 + small / k * series
+    large = ngs.IfPos(x * x - _NEARLY_ZERO**2, x, 1.0)
+    return ngs.IfPos(x * x - _NEARLY_ZERO**2, (ngs.exp(large) - 1.0) / large, series)
+
+
+def _listed(**lists: tuple[Constant, ...]) -> dict[str, Constant]:
+    """Constants of lists by name and place."""
+    return {f"{name}[{i}]": value for name, values in lists.items() for i, value in enumerate(values)}
+
+
+def _check_terms(law: str, **lists: tuple[Constant, ...]) -> None:
+    """Refuse lists of different lengths, and exponents of zero (StudyError)."""
+    lengths = [len(values) for values in lists.values()]
+    if len(set(lengths)) > 1 or 0 in lengths:
+        *names, last = lists
+        raise StudyError(
+            f"{law}: {', '.join(names)} and {last} must be lists of one length, "
+            f"but there are {' and '.join(map(str, lengths))}"
+        )
+    if any(evaluate(exponent) == 0.0 for exponent in lists["exponents"]):
+        raise StudyError(f"{law}: an exponent of 0 leaves its term without stiffness; remove the term")
