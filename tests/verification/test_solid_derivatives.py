@@ -21,7 +21,7 @@ from morph_dslam.mechanics.loads import (
     PointLoad,
 )
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic, turned_direction
-from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.materials.isotropic import Hyperfoam, NeoHookean, Ogden
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.rigid_mesh import RigidMesh
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
@@ -110,6 +110,15 @@ def by_fibre_angle(mu: ParameterSymbols) -> SolidProblem:
     material = HolzapfelGasserOgden(shear=1e6, bulk=5e6, k1=2e6, k2=0.5, dispersion=0.1, fibre=fibre)
     load = DeadTraction("x_max", (2e5, 0.0, 0.0))
     return SolidProblem(MESH, {"all": material}, [fixed("x_min")], [load], mu)
+
+
+def by_principal_stretches(mu: ParameterSymbols) -> SolidProblem:
+    """Rubber and foam whose energies are sums of powers of stretches, in the cells that are default for hex8."""
+    rubber = Ogden(moduli=(1e6 * (1.0 + mu["p"]), 1e5), exponents=(1.3, -2.0 - mu["p"]), bulk=1e7)
+    foam = Hyperfoam(moduli=(5e5,), exponents=(4.0,), poissons=(0.3 * mu["p"],))
+    mesh = block((1.0, 0.5, 0.5), (2, 1, 1), "hex8")
+    mesh = replace(mesh, cell_sets={"foam": np.array([1])})
+    return SolidProblem(mesh, {"all": rubber, "foam": foam}, [fixed("x_min")], [DeadTraction("x_max", DOWN)], mu)
 
 
 def by_foundation(mu: ParameterSymbols) -> SolidProblem:

@@ -10,6 +10,7 @@ Any arithmetic on a symbol is an expression that NGSolve evaluates and different
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import ngsolve as ngs
@@ -75,4 +76,12 @@ class ParameterSymbols:
 
 def is_zero(expression: Any) -> bool:
     """Whether NGSolve has found an expression to vanish identically."""
-    return str(expression).lstrip().startswith("ZeroCoefficientFunction")
+    # The text of an expression has shared parts once for each use, and may fill the memory; that of a compiled one not.
+    steps = str(expression.Compile()).split("\n", 2)[1:]
+    return steps[0].startswith(_zero_step()) and not steps[1].strip()
+
+
+@cache
+def _zero_step() -> str:
+    """The only step of a compiled zero."""
+    return str(ngs.CF(0.0).Compile()).splitlines()[1]

@@ -9,8 +9,7 @@ constants or the undeformed shape contain them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +20,13 @@ from numpy.typing import NDArray
 
 from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.kinematics import Kinematics
-from morph_dslam.mechanics.materials.base import VOIGT, green_lagrange
+from morph_dslam.mechanics.materials.base import VOIGT
 from morph_dslam.mechanics.ngsolve_mesh import corner_monomials, reference_points
 from morph_dslam.meshing.cell_types import CellType
 from morph_dslam.model.reduced_model import von_mises
 
 if TYPE_CHECKING:
+    from morph_dslam.mechanics.parameters import ParameterSymbols
     from morph_dslam.mechanics.solid import SolidProblem
 
 Array = NDArray[np.float64]
@@ -50,13 +50,63 @@ def _components(name: str, tensors: Array) -> Array:
     return values[:, _VOIGT_COLUMNS] if COMPONENTS[name] == 6 else values
 
 
-@dataclass(frozen=True)
-class _RegionFields:
-    """Fields of one material as expressions, and the variables that they depend on."""
+def _derived(name: str, F: Array, P: Array) -> Array:
+    """A field (p, 3, 3) from F and the first Piola-Kirchhoff stress P."""
+    if name == "deformation_gradient":
+        return F
+    if name == "strain":
+        return 0.5 * (np.swapaxes(F, 1, 2) @ F - np.eye(3))
+    if name == "first_piola_kirchhoff":
+        return P
+    return P @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
 
-    fields: dict[str, Any]
-    gradient: Any
-    pressure: Any | None
+
+def _derived_change(name: str, F: Array, P: Array, dF: Array, dP: Array) -> Array:
+    """Change (p, 3, 3) of a field with those of F and P."""
+    if name == "deformation_gradient":
+        return dF
+    if name == "strain":
+        product = np.swapaxes(F, 1, 2) @ dF
+        return 0.5 * (product + np.swapaxes(product, 1, 2))
+    if name == "first_piola_kirchhoff":
+        return dP
+    J = np.linalg.det(F)[:, None, None]
+    growth = np.trace(np.linalg.solve(F, dF), axis1=1, axis2=2)[:, None, None]
+    return (dP @ np.swapaxes(F, 1, 2) + P @ np.swapaxes(dF, 1, 2) - growth * (P @ np.swapaxes(F, 1, 2))) / J
+
+
+class _RegionLaw:
+    """Stress of one material and its derivatives, compiled; those that no run asks for are never made.
+
+    All derivatives by F are by the whole of it, and come last: so they share their sub-expressions. Along a direction,
+    or before those by anything else, those of laws in principal stretches would fill the memory.
+    """
+
+    def __init__(self, region: Any, F: Any, unknowns: list[Any], symbols: ParameterSymbols) -> None:
+        self._F, self._symbols = F.MakeVariable(), symbols
+        pressure = region.pressure(unknowns)
+        self._pressure = pressure.MakeVariable() if pressure is not None else None
+        self._energy = region.elastic_energy(self._F, self._pressure)
+
+    @cached_property
+    def stress(self) -> Any:
+        """P, 3x3."""
+        return self._energy.Diff(self._F).Compile()
+
+    @cached_property
+    def tangent(self) -> Any:
+        """Derivative of P by F."""
+        return self._energy.Diff(self._F).Diff(self._F).Compile()
+
+    @cached_property
+    def by_pressure(self) -> Any | None:
+        """Derivative of P by the pressure."""
+        return None if self._pressure is None else self._energy.Diff(self._pressure).Diff(self._F).Compile()
+
+    @cached_property
+    def by_parameters(self) -> dict[int, Any]:
+        """Derivatives of P by parameters at a fixed solution, by their index."""
+        return {i: slope.Diff(self._F).Compile() for i, slope in self._symbols.derivatives(self._energy).items()}
 
 
 class _Compatible:
@@ -113,25 +163,13 @@ class Recovery:
         self._problem, assembly = problem, problem.assembly
         enhanced = isinstance(assembly, EnhancedAssembly)
         self._solution = _Enhanced(problem, assembly) if enhanced else _Compatible(problem)
-        self._regions, self._pressure_directions = [], []
-        unknowns = zip(problem.regions, self._solution.pressures, self._solution.pressure_changes, strict=True)
-        for region, p, dp in unknowns:
-            self._regions.append(self._region_fields(region, p))
-            self._pressure_directions.append(region.pressure(dp))
+        self._laws = [
+            _RegionLaw(region, self._solution.F, unknowns, problem.symbols)
+            for region, unknowns in zip(problem.regions, self._solution.pressures, strict=True)
+        ]
+        changes = zip(problem.regions, self._solution.pressure_changes, strict=True)
+        self._pressure_changes = [region.pressure(unknowns) for region, unknowns in changes]
         self._at_nodes: tuple[NDArray, sp.csr_matrix] | None = None
-
-    def _region_fields(self, region: Any, unknowns: list[Any]) -> _RegionFields:
-        F = self._solution.F.MakeVariable()
-        pressure = region.pressure(unknowns)
-        pressure = pressure.MakeVariable() if pressure is not None else None
-        P = region.elastic_energy(F, pressure).Diff(F)
-        fields = {
-            "deformation_gradient": F,
-            "strain": green_lagrange(F),
-            "first_piola_kirchhoff": P,
-            "stress": P * F.trans / ngs.Det(F),
-        }
-        return _RegionFields(fields, F, pressure)
 
     def at_nodes(self, dofs: Array, mu: Array, names: tuple[str, ...] = ("strain", "stress")) -> dict[str, Array]:
         """Fields by name at the nodes: "displacement" (n, 3) m, and ``names`` of `COMPONENTS` (n, c), SI.
@@ -165,10 +203,8 @@ class Recovery:
         result = {"displacement": np.array([self._problem.nodal_displacement(s) for s in dof_slopes])}
         indices = range(len(dof_slopes)) if by_parameters else [None] * len(dof_slopes)
         directions = list(zip(indices, dof_slopes, strict=True))
-        for name in names:
-            slopes = [average @ s for s in self._slopes(name, dofs, mu, directions, points)]
-            result[name] = np.array(slopes)
-        return result
+        slopes = self._slopes(names, dofs, mu, directions, points)
+        return result | {name: np.array([average @ slope for slope in found]) for name, found in slopes.items()}
 
     def _set(self, dofs: Array, mu: Array) -> None:
         self._problem.symbols.set(mu)
@@ -181,61 +217,69 @@ class Recovery:
 
     def _evaluate(self, name: str, dofs: Array, mu: Array, points: NDArray) -> Array:
         self._set(dofs, mu)
-        values = self._by_region([region.fields[name] for region in self._regions], points)
-        history = self._problem.history
+        F, P = self._gradient(points), self._by_region([law.stress for law in self._laws], points)
+        values, history = _derived(name, F, P), self._problem.history
         if history and name in STRESSES:
-            F = self._by_region([region.gradient for region in self._regions], points)
             values += _overstress(name, F, history.remembered_at(points))
         return _components(name, values)
 
+    def _gradient(self, points: NDArray) -> Array:
+        return self._by_region([self._solution.F] * len(self._laws), points)
+
     def _slopes(
-        self, name: str, dofs: Array, mu: Array, directions: list[tuple[int | None, Array]], points: NDArray
-    ) -> list[Array]:
-        """Derivatives along changes of the solution, each with the parameter that causes it or None."""
+        self,
+        names: tuple[str, ...],
+        dofs: Array,
+        mu: Array,
+        directions: list[tuple[int | None, Array]],
+        points: NDArray,
+    ) -> dict[str, list[Array]]:
+        """Derivatives of fields along changes of the solution, each with the parameter that causes it or None."""
         self._set(dofs, mu)
-        through_state = [
-            self._directional(region, region.fields[name], dp)
-            for region, dp in zip(self._regions, self._pressure_directions, strict=True)
-        ]
-        result = []
-        by_parameter = [self._problem.symbols.derivatives(region.fields[name]) for region in self._regions]
+        F, P = self._gradient(points), self._by_region([law.stress for law in self._laws], points)
+        tangent = self._by_region([law.tangent for law in self._laws], points, (9, 9))
+        result: dict[str, list[Array]] = {name: [] for name in names}
         for index, slope in directions:
             self._solution.set_change(dofs, slope, index)
-            total = self._by_region(through_state, points)
-            if index is not None and any(index in explicit for explicit in by_parameter):
-                zero = ngs.CF((0.0,) * 9, dims=(3, 3))
-                total += self._by_region([explicit.get(index, zero) for explicit in by_parameter], points)
-            if self._problem.history and name in STRESSES:
-                total += self._overstress_slope(name, index, points)
-            result.append(_components(name, total))
+            dF = self._by_region([self._solution.change] * len(self._laws), points)
+            dP = (tangent @ dF.reshape(-1, 9, 1)).reshape(-1, 3, 3) + self._stress_changes(index, points)
+            explicit = None if index is None else self._solution.explicit.get(index)
+            if explicit is not None:
+                dF = dF + self._by_region([explicit] * len(self._laws), points)
+            for name in names:
+                total = _derived_change(name, F, P, dF, dP)
+                if self._problem.history and name in STRESSES:
+                    total += self._overstress_slope(name, F, dF, points)
+                result[name].append(_components(name, total))
         return result
 
-    def _directional(self, region: _RegionFields, field: Any, pressure_direction: Any | None) -> Any:
-        change = field.Diff(region.gradient, self._solution.change)
-        if region.pressure is not None:
-            change = change + field.Diff(region.pressure, pressure_direction)
-        return change
+    def _stress_changes(self, index: int | None, points: NDArray) -> Array:
+        """Change (p, 3, 3) of P with pressures in the direction that is set, and with a parameter itself."""
+        zero, result = ngs.CF((0.0,) * 9, dims=(3, 3)), np.zeros((len(points), 3, 3))
+        if any(law.by_pressure is not None for law in self._laws):
+            pairs = zip(self._laws, self._pressure_changes, strict=True)
+            result += self._by_region(
+                [zero if law.by_pressure is None else law.by_pressure * change for law, change in pairs], points
+            )
+        if index is not None and any(index in law.by_parameters for law in self._laws):
+            result += self._by_region([law.by_parameters.get(index, zero) for law in self._laws], points)
+        return result
 
-    def _overstress_slope(self, name: str, index: int | None, points: NDArray) -> Array:
-        """Derivative (p, 3, 3) of the remembered stress's part, in the direction that is set."""
+    def _overstress_slope(self, name: str, F: Array, dF: Array, points: NDArray) -> Array:
+        """Derivative (p, 3, 3) of the remembered stress's part along a change of F."""
         history = self._problem.history
         assert history is not None
-        F = self._by_region([region.gradient for region in self._regions], points)
-        dF = self._by_region([self._solution.change] * len(self._regions), points)
-        explicit = None if index is None else self._solution.explicit.get(index)
-        if explicit is not None:
-            dF += self._by_region([explicit] * len(self._regions), points)
         H, step = history.remembered_at(points), 1e-6
         return (_overstress(name, F + step * dF, H) - _overstress(name, F - step * dF, H)) / (2.0 * step)
 
-    def _by_region(self, expressions: list[Any], points: NDArray) -> Array:
-        """Values (p, 3, 3) of one 3x3 expression for each region at mesh points."""
+    def _by_region(self, expressions: list[Any], points: NDArray, shape: tuple[int, int] = (3, 3)) -> Array:
+        """Values (p, *shape) of one expression for each region at mesh points."""
         owners = self._problem.cell_materials[self._problem.geometry.cell_of_element[points["nr"]]]
-        values = np.zeros((len(points), 9))
+        values = np.zeros((len(points), shape[0] * shape[1]))
         for number, expression in zip(np.unique(self._problem.cell_materials), expressions, strict=True):
             rows = np.flatnonzero(owners == number)
-            values[rows] = np.asarray(expression.Compile()(points[rows])).reshape(len(rows), 9)
-        return values.reshape(-1, 3, 3)
+            values[rows] = np.asarray(expression.Compile()(points[rows])).reshape(len(rows), -1)
+        return values.reshape(-1, *shape)
 
     def _node_rule(self) -> tuple[NDArray, sp.csr_matrix]:
         """Mesh points (q,) in all cells, and the matrix (n_nodes, q) that takes values there to nodes."""
