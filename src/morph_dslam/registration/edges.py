@@ -324,6 +324,7 @@ class EdgeEvidence:
     inner_chance : likewise.
     count : number of points of the outline.
     n_inner : of the inner edges.
+    gain_std : standard deviation of ``gain``, by how far the keyframes are apart on it; 0 of a single one.
     """
 
     share: float
@@ -332,6 +333,7 @@ class EdgeEvidence:
     inner_chance: float
     count: int
     n_inner: int = 0
+    gain_std: float = 0.0
 
     @property
     def total(self) -> float:
@@ -485,6 +487,9 @@ class EdgeImages:
         def mean(values: NDArray, rows: NDArray[np.bool_]) -> float:
             return float(np.mean(values[rows])) if rows.any() else 0.0
 
+        gains = [
+            _beyond_chance(*(mean(part, r) for part in (f, c))) for f, c, r in zip(on, chance, outline, strict=True)
+        ]
         return EdgeEvidence(
             mean(found, rim),
             mean(by_chance, rim),
@@ -492,6 +497,7 @@ class EdgeImages:
             mean(by_chance, ~rim),
             int(rim.sum()),
             int((~rim).sum()),
+            float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else 0.0,
         )
 
 
