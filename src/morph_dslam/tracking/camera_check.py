@@ -46,7 +46,9 @@ class CameraCheck:
         if len(points) != len(seen.pixels):
             return
         pose = seen.state.camera_from_object
-        deformed, rest = (self._camera.project(local) for local in (points.in_camera(seen.state), pose.apply(points.rest)))
+        deformed, rest = (
+            self._camera.project(local) for local in (points.in_camera(seen.state), pose.apply(points.rest))
+        )
         pixels = seen.pixels - deformed + rest
         ids = np.flatnonzero((seen.weights > 0.0) & np.isfinite(pixels).all(axis=1))
         self._rest = points.rest
