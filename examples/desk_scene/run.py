@@ -194,7 +194,8 @@ def run(arguments: argparse.Namespace) -> None:
     camera = refine_camera(md.open_source(frames), given, ("readout",), colour_only).camera
     print(f"readout_ms={1e3 * camera.readout_s:.1f}")
     truth = load_trajectory(arguments.data / "tags_shutter_corrected.txt")
-    depth = cv2.imread(str(arguments.data / "depth" / "0000.png"), cv2.IMREAD_UNCHANGED) / DEPTHS_PER_METRE
+    stored = cv2.imread(str(arguments.data / "depth" / "0000.png"), cv2.IMREAD_UNCHANGED)
+    depth = np.asarray(stored, dtype=np.float64) / DEPTHS_PER_METRE
     print(f"truth: depth_mm={depth_gap(CAMERA_FROM_CUBE, camera, depth):+.1f}")
     attempts, path_mm = [], np.nan
     for name, (first, last, with_depth) in MAPS.items():

@@ -40,10 +40,13 @@ def checked(points, given, turn):
         pixels = cv2.projectPoints(points.rest, rotation.as_rotvec(), place, CAMERA.matrix, None)[0][:, 0]
         pixels = pixels + 0.2 * rng.standard_normal(pixels.shape)
         _, spin, shift = cv2.solvePnP(points.rest, pixels, given.matrix, None)
-        pose = RigidTransform(Rotation.from_rotvec(spin.ravel()).as_matrix(), shift.ravel())
+        spin, shift = np.asarray(spin, dtype=np.float64).ravel(), np.asarray(shift, dtype=np.float64).ravel()
+        pose = RigidTransform(Rotation.from_rotvec(spin).as_matrix(), shift)
         seen = (rotation.apply(points.rest)[:, 2] < 0.0).astype(float)
         check.add(k / 30.0, points, Keyframe(pixels, seen, State(np.empty(0), pose), 0.2))
-    return check.estimate()
+    estimate = check.estimate()
+    assert estimate is not None
+    return estimate
 
 
 @pytest.mark.parametrize(("factor", "wrong"), [(1.0, set()), (1.1, {"focal"}), (0.9, {"focal"})])
