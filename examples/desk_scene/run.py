@@ -2,8 +2,9 @@
 
 The recording (lagadic/visp-images, rbt) is not part of the project: a folder with `rgb/0000.jpg` to `rgb/0098.jpg`,
 `depth/` every third frame (5000 values per metre, as in TUM's layout), `camera.yaml`, `cube.obj` in metres, and the
-camera path `tags_shutter_corrected.txt`. The cube's true pose in frame 0 is from six corners picked by hand (0.95 px);
-measured depth has its faces 6 mm nearer.
+camera path `tags_shutter_corrected.txt`. The cube's true pose in frame 0 is from six corners picked by hand (0.95 px),
+which a real cube has rounded. `depth_mm`, the median distance of the measured depth of frame 0 from the cube's faces,
+says how far that pose is off itself: the faces that were measured are 6.5 mm nearer.
 
 The last line gives the largest errors of the cube in frame 0 (centre or size, and angle modulo its 24 rotations), of
 the places found, that of the camera's path from colour alone, how many of four maps give the cube without a hint and
@@ -45,7 +46,7 @@ CAMERA_FROM_CUBE = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-EDGE_MM, FPS, N_FRAMES = 85.0, 30.0, 99
+EDGE_MM, FPS, N_FRAMES, DEPTHS_PER_METRE = 85.0, 30.0, 99, 5000.0
 #: Each map's first and last frame, and whether it uses the depth images.
 MAPS = {"colour": (None, None, False), "depth": (None, None, True), "start": (0, 50, True), "rest": (20, 97, False)}
 #: What counts as found: centre and size, mm, and angle, degrees.
@@ -54,13 +55,17 @@ PLACE_LIMIT, ANGLE_LIMIT = 5.0, 3.0
 
 @dataclass(frozen=True)
 class Attempt:
-    """One registration: its errors (None if nothing was found), whether it is called ambiguous, and its time."""
+    """One registration: its errors (None if nothing was found), whether it is called ambiguous, and its time.
+
+    ``depth_mm`` is `depth_gap` at the place.
+    """
 
     map: str
     hint: str
     seconds: float
     place_mm: float | None = None
     angle_deg: float | None = None
+    depth_mm: float | None = None
     ambiguous: bool = True
 
     @property
@@ -86,7 +91,7 @@ class Attempt:
             return f"{self.map} {self.hint}: not found ({self.seconds:.1f} s)"
         return (
             f"{self.map} {self.hint}: place_mm={self.place_mm:.2f} angle_deg={self.angle_deg:.2f} "
-            f"ambiguous={'yes' if self.ambiguous else 'no'} ({self.seconds:.1f} s)"
+            f"depth_mm={self.depth_mm:+.1f} ambiguous={'yes' if self.ambiguous else 'no'} ({self.seconds:.1f} s)"
         )
 
 
@@ -121,8 +126,25 @@ def path_errors(path: Trajectory, truth: Trajectory) -> tuple[float, float]:
     return 1e3 * float(np.sqrt(np.mean(misses**2))), 1.0 / fitted.scale
 
 
-def attempt(name: str, hint: str, scene: md.Scene, model: md.ReducedModel, camera_0: Array, unit: float) -> Attempt:
-    """Register the cube once and compare it with the truth in frame 0."""
+def depth_gap(camera_from_cube: Array, camera: md.Camera, depth: Array) -> float:
+    """Median distance of measured depths (h, w), metres, from the drawn faces of the cube, mm; positive behind them."""
+    row, column = np.nonzero(depth > 0.0)
+    rays = camera.rays(np.column_stack([column, row]).astype(float))
+    turned, eye = rays @ camera_from_cube[:3, :3], -camera_from_cube[:3, :3].T @ camera_from_cube[:3, 3]
+    half = EDGE_MM / 2e3
+    # The ray enters the cube where it has crossed the nearer plane of all three pairs (slabs).
+    entries = (-half * np.sign(turned) - eye) / turned
+    face, drawn = entries.argmax(axis=1), entries.max(axis=1)
+    beside = np.abs(eye + drawn[:, None] * turned)
+    beside[np.arange(len(face)), face] = 0.0
+    on_face = beside.max(axis=1) < 0.9 * half
+    return 1e3 * float(np.median(depth[row, column][on_face] - drawn[on_face]))
+
+
+def attempt(
+    name: str, hint: str, scene: md.Scene, model: md.ReducedModel, camera_0: Array, unit: float, depth: Array
+) -> Attempt:
+    """Register the cube once and compare it with the truth, and with measured depths (h, w), metres, in frame 0."""
     began = time.perf_counter()
     try:
         found = md.register(scene, model, landmarks=HERE / "landmarks.csv" if hint == "clicks" else None)
@@ -138,9 +160,11 @@ def attempt(name: str, hint: str, scene: md.Scene, model: md.ReducedModel, camer
     angles = [(Rotation.from_matrix(turn) * each).magnitude() for each in Rotation.create_group("O")]
     off = 1e3 * float(np.linalg.norm(centre - CAMERA_FROM_CUBE[:3, 3]))
     size = EDGE_MM * abs(placed.scale / unit - 1.0)
+    there = np.vstack([np.column_stack([pose[:3, :3] / placed.scale, centre]), [0.0, 0.0, 0.0, 1.0]])
+    gap, angle = depth_gap(there, scene.camera, depth), float(np.degrees(min(angles)))
     picture = HERE / "output" / f"{name}_{hint}.jpg"
     cv2.imwrite(str(picture), draw_registration(found, scene))
-    return Attempt(name, hint, seconds, max(off, size), float(np.degrees(min(angles))), found.ambiguous)
+    return Attempt(name, hint, seconds, max(off, size), angle, gap, found.ambiguous)
 
 
 def write_report(attempts: list[Attempt], last_line: str) -> None:
@@ -148,11 +172,13 @@ def write_report(attempts: list[Attempt], last_line: str) -> None:
     lines = [
         "# The cube on the desk",
         "",
-        "| map | hint | place [mm] | angle [deg] | ambiguous | s |",
-        "|---|---|---|---|---|---|",
+        "| map | hint | place [mm] | angle [deg] | measured depth from its faces [mm] | ambiguous | s |",
+        "|---|---|---|---|---|---|---|",
     ]
     for each in attempts:
-        errors = "- | -" if each.place_mm is None else f"{each.place_mm:.2f} | {each.angle_deg:.2f}"
+        errors = "- | - | -"
+        if each.place_mm is not None:
+            errors = f"{each.place_mm:.2f} | {each.angle_deg:.2f} | {each.depth_mm:+.1f}"
         doubt = "yes" if each.ambiguous else "no"
         lines.append(f"| {each.map} | {each.hint} | {errors} | {doubt} | {each.seconds:.1f} |")
     pictures = [f"![{each.map}]({each.map}_{each.hint}.jpg)" for each in attempts if each.place_mm is not None]
@@ -168,6 +194,9 @@ def run(arguments: argparse.Namespace) -> None:
     camera = refine_camera(md.open_source(frames), given, ("readout",), colour_only).camera
     print(f"readout_ms={1e3 * camera.readout_s:.1f}")
     truth = load_trajectory(arguments.data / "tags_shutter_corrected.txt")
+    stored = cv2.imread(str(arguments.data / "depth" / "0000.png"), cv2.IMREAD_UNCHANGED)
+    depth = np.asarray(stored, dtype=np.float64) / DEPTHS_PER_METRE
+    print(f"truth: depth_mm={depth_gap(CAMERA_FROM_CUBE, camera, depth):+.1f}")
     attempts, path_mm = [], np.nan
     for name, (first, last, with_depth) in MAPS.items():
         scene = md.map_scene(md.open_source(frames, first, last), camera, replace(colour_only, use_depth=with_depth))
@@ -175,7 +204,7 @@ def run(arguments: argparse.Namespace) -> None:
         path_mm = error if name == "colour" else path_mm
         camera_0, unit = frame_0(scene, frames), 1.0 if scene.is_metric else unit
         for hint in ("plain", "clicks"):
-            attempts.append(attempt(name, hint, scene, model, camera_0, unit))
+            attempts.append(attempt(name, hint, scene, model, camera_0, unit, depth))
             print(attempts[-1].line(), flush=True)
     found = [each for each in attempts if each.is_found]
     plain, hinted = (sum(each.hint == hint for each in found) for hint in ("plain", "clicks"))

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.edges import EdgeImages, MeshEdges, Sighting
-from morph_dslam.registration.scene import camera_from_object
+from morph_dslam.registration.scene import View, camera_from_object
 from morph_dslam.registration.view_registration import EdgeSearch, Hints
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.patches import normalize_contrast
@@ -57,6 +58,46 @@ def test_edges_lay_an_object_from_near(scan):
     assert images.evidence(edges, found).gain > 0.8
     beside = SimilarityTransform(1.0, np.eye(3), np.array([0.02, 0.0, 0.0]))
     assert images.evidence(edges, WORLD @ beside).gain < 0.5
+
+
+#: A cube of 85 mm: corners, metres, and its faces as quadrilaterals seen from outside.
+CUBE = 0.0425 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+DESK_CAMERA = Camera(640, 480, 607.2, 607.2, 321.4, 241.9)
+
+
+def painted(corners, greys, background, finer=16):
+    """An image (h, w) of convex faces, by OpenCV's polygons in pixels ``finer`` times finer, and their means."""
+    big = np.full((480 * finer, 640 * finer), background, np.uint8)
+    for corner, grey in zip(corners, greys, strict=True):
+        # A pixel's centre is at whole numbers, and it reaches half a pixel to all sides.
+        cv2.fillPoly(big, [np.rint(256 * ((corner + 0.5) * finer - 0.5)).astype(np.int32)], grey, shift=8)
+    image = cv2.resize(big, (640, 480), interpolation=cv2.INTER_AREA).astype(float)
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
+def test_depth_by_edges_is_unbiased():
+    """A cube as large as on a real desk, painted by OpenCV: half a pixel at its outline would be 1 % of its depth."""
+    rng = np.random.default_rng(0)
+    sides = np.concatenate([FACES[:, :3], FACES[:, [0, 2, 3]]])
+    edges, misses = MeshEdges(CUBE, sides), []
+    about = np.array([[-0.569, -0.821, 0.043], [-0.051, -0.018, -0.999], [0.821, -0.570, -0.032]])
+    about = Rotation.from_matrix(about)
+    for background in (60, 140, 220) * 4:
+        turn = Rotation.from_rotvec(rng.normal(0.0, 0.2, 3)) * about
+        place = np.array([*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.4, 0.6)])
+        local = turn.apply(CUBE) + place
+        normals = np.cross(local[FACES[:, 1]] - local[FACES[:, 0]], local[FACES[:, 2]] - local[FACES[:, 0]])
+        facing = np.einsum("fx,fx->f", normals, local[FACES[:, 0]]) < 0.0
+        greys = rng.permutation([20, 90, 115, 165, 185, 245])[facing].tolist()
+        image = painted(DESK_CAMERA.project(local)[FACES[facing]], greys, background) + rng.normal(0.0, 1.0, (480, 640))
+        eye = RigidTransform(np.eye(3), np.zeros(3))
+        grey = normalize_contrast(image.round().clip(0, 255).astype(np.uint8))
+        view = View(0, grey, eye, np.empty(0, np.int64), np.empty((0, 2)))
+        start = SimilarityTransform(1.0, turn.as_matrix(), place + rng.normal(0.0, 2e-3, 3))
+        found, _ = EdgeImages([view], DESK_CAMERA).refine(edges, start, metric=True)
+        misses.append((found.translation - place) / place[2])
+    assert np.abs(np.mean(misses, axis=0)).max() < 5e-4
 
 
 def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):

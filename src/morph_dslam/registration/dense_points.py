@@ -8,9 +8,7 @@ sweeping: Collins, A space-sweep approach to true multi-image matching, 1996; at
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,6 +21,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.icp import Surface, surface_equations
 from morph_dslam.registration.scene import MapPoints, View
+from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]
 #: Change of grey in a pixel from which on its depth is asked for; variance of a patch that can be compared.
@@ -112,8 +111,7 @@ def with_dense_points(
             return _Depths(view.depths[:, :2].astype(float), view.depths[:, 2].astype(float))
         return _stereo(points, view, views, camera)
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        measured = list(threads.map(depths_of, chosen))
+    measured = on_all_cores(depths_of, chosen)
     positions, viewpoints, count, richer = [points.positions], [points.viewpoints], len(points), []
     for view, found in zip(chosen, measured, strict=True):
         local = camera.rays(found.pixels) * found.depths[:, None]

@@ -25,7 +25,7 @@ from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.registration.dense_points import PointsOnSurface
 from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
 from morph_dslam.registration.scene import View, camera_from_object
-from morph_dslam.render.rasteriser import draw_depth
+from morph_dslam.render.rasteriser import draw_depth, image_region
 
 Array = NDArray[np.float64]
 #: Cosine of the angle between two triangles from which their edge is seen, points along the edges of the size of the
@@ -39,6 +39,8 @@ LEAST_EDGE, PARALLEL = 3.0, 0.8
 REACHES = (16, 12, 10, 8, 6, 5, 4, 3, 3, 3)
 #: Standard deviation of an edge's place and of a keyframe's own shift, pixels.
 EDGE_PX, SHIFT_PX = 1.0, 2.0
+#: So many points of a view's edges count as independent.
+INDEPENDENT = 40.0
 #: Standard deviation of a landmark that was clicked, pixels.
 CLICK_PX = 2.0
 #: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
@@ -84,6 +86,8 @@ class MeshEdges:
         keys = np.sort(sides, axis=1)
         order = np.lexsort((keys[:, 1], keys[:, 0]))
         _, first, uses = np.unique(keys[order], axis=0, return_index=True, return_counts=True)
+        #: Whether the surface has an inside, so that its triangles that are turned away are hidden.
+        self._closed = bool((uses == 2).all())
         ends, one = keys[order][first], owner[order[first]]
         other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
         normals = triangle_normals(nodes, triangles)
@@ -123,24 +127,61 @@ class MeshEdges:
 
     def depth(self, pose: RigidTransform, camera: Camera, shrink: int = 1) -> Array:
         """The object's depth in every pixel of a camera with so many times fewer of them; inf beside it."""
+        whole = np.full((camera.height // shrink, camera.width // shrink), np.inf)
+        drawn, left, top = self._drawn(pose, camera, shrink)
+        whole[top : top + drawn.shape[0], left : left + drawn.shape[1]] = drawn
+        return whole
+
+    def _drawn(self, pose: RigidTransform, camera: Camera, shrink: int) -> tuple[NDArray[np.float32], int, int]:
+        """The depth of `depth` where the object is, and the region's left and top."""
         nodes = pose.apply(self.nodes)
-        size = camera.height // shrink, camera.width // shrink
-        if nodes[:, 2].min() <= 0.0:
-            return np.full(size, np.inf)
-        drawn = (camera.project(nodes) + 0.5) / shrink - 0.5
-        depth = draw_depth(np.ascontiguousarray(drawn), nodes[:, 2].copy(), self.triangles, False, *size)[1]
-        return np.asarray(depth, dtype=np.float64)
+        pixels = (camera.project(nodes) + 0.5) / shrink - 0.5
+        region = image_region(pixels, camera.height // shrink, camera.width // shrink)
+        if region is None or nodes[:, 2].min() <= 0.0:
+            return np.empty((0, 0), np.float32), 0, 0
+        top, left = region[0].start, region[1].start
+        size = region[0].stop - top, region[1].stop - left
+        pixels -= [left, top]
+        return (
+            draw_depth(np.ascontiguousarray(pixels), nodes[:, 2].copy(), self.triangles, self._closed, *size)[1],
+            left,
+            top,
+        )
 
     def _seen(self, pose: RigidTransform, camera: Camera, local: Array, pixels: Array) -> NDArray[np.bool_]:
         """Which points (p,) are in the image, and not behind the object."""
-        depth = self.depth(pose, camera, SHRINK)
-        size = depth.shape
-        farthest = cv2.dilate(np.where(np.isfinite(depth), depth, 1e9).astype(np.float32), np.ones((3, 3), np.uint8))
-        column, row = np.rint((np.nan_to_num(pixels, nan=-9.0) + 0.5) / SHRINK - 0.5).astype(np.int64).T
-        inside = (column >= 2) & (row >= 2) & (column < size[1] - 2) & (row < size[0] - 2)
-        seen = np.zeros(len(local), dtype=bool)
-        seen[inside] = local[inside, 2] <= farthest[row[inside], column[inside]] + 0.01 * self.size
-        return seen
+        small = (pixels + 0.5) / SHRINK - 0.5
+        size = camera.width // SHRINK, camera.height // SHRINK
+        return not_behind(*self._drawn(pose, camera, SHRINK), *size, small, local[:, 2], 0.01 * self.size)
+
+
+@njit(cache=True, nogil=True)
+def not_behind(depth, left, top, width, height, pixels, depths, tolerance):
+    """Which points (p,) are at least two pixels inside of an image, and not behind what is drawn around them.
+
+    Parameters
+    ----------
+    depth : (h, w) drawn, inf where nothing is.
+    left, top : where this is in the image.
+    width, height : of the image.
+    pixels : (p, 2) of the points, NaN behind the camera.
+    depths : (p,) of the points.
+    tolerance : by which a point may be behind the farthest of the pixels around it.
+    """
+    seen = np.zeros(len(pixels), dtype=np.bool_)
+    for p in range(len(pixels)):
+        if not (np.isfinite(pixels[p, 0]) and np.isfinite(pixels[p, 1])):
+            continue
+        column, row = int(np.rint(pixels[p, 0])), int(np.rint(pixels[p, 1]))
+        if column < 2 or row < 2 or column >= width - 2 or row >= height - 2:
+            continue
+        farthest = 0.0
+        for y in range(row - top - 1, row - top + 2):
+            for x in range(column - left - 1, column - left + 2):
+                inside = 0 <= x < depth.shape[1] and 0 <= y < depth.shape[0]
+                farthest = max(farthest, depth[y, x]) if inside else np.inf
+        seen[p] = depths[p] <= farthest + tolerance
+    return seen
 
 
 def _spaced(lengths: Array, spacing: float) -> tuple[NDArray[np.int64], Array]:
@@ -198,6 +239,47 @@ def find_edges(slope_x, slope_y, pixels, normals, reach, least):
     return offsets
 
 
+@njit(cache=True, nogil=True)
+def edge_equations(points, turned_about, normals, offsets, reach, intrinsics):
+    """Normal equations of a pose's step and of the image's own shift by edges found along normals.
+
+    Parameters
+    ----------
+    points : (p, 3) of the edges, in the camera.
+    turned_about : (3,) the point about which the pose's step turns, as in `pose_jacobian`.
+    normals : (p, 2) across the edges.
+    offsets : (p,) where they were found along these, pixels.
+    reach : pixels searched.
+    intrinsics : fx, fy, cx, cy.
+
+    Returns
+    -------
+    Matrix and right side (7, 7) of the pose's step, the latter as last row and column; the same against the shift
+    (7, 2); and the shift's matrix (2, 2).
+    """
+    count, width = len(points), max(0.5 * reach, 1.5)
+    # Neighbours share their errors: a view's edges count as so many independent points.
+    independent = min(1.0, INDEPENDENT / max(count, 1)) / EDGE_PX**2
+    own, by_shift, shift, row = np.zeros((7, 7)), np.zeros((7, 2)), np.eye(2) / SHIFT_PX**2, np.empty(7)
+    for p in range(count):
+        x, y, z = points[p]
+        a, b = normals[p, 0] * intrinsics[0] / z, normals[p, 1] * intrinsics[1] / z
+        c = -(a * x + b * y) / z
+        x, y, z = points[p] - turned_about
+        row[0], row[1], row[2] = y * c - z * b, z * a - x * c, x * b - y * a
+        row[3], row[4], row[5], row[6] = a, b, c, offsets[p]
+        weight = independent / (1.0 + (offsets[p] / width) ** 2) ** 2
+        for i in range(7):
+            for j in range(7):
+                own[i, j] += weight * row[i] * row[j]
+            for j in range(2):
+                by_shift[i, j] += weight * row[i] * normals[p, j]
+        for i in range(2):
+            for j in range(2):
+                shift[i, j] += weight * normals[p, i] * normals[p, j]
+    return own, by_shift, shift
+
+
 @dataclass(frozen=True)
 class Sighting:
     """Points of an object and where a camera in the map sees them.
@@ -242,6 +324,7 @@ class EdgeEvidence:
     inner_chance : likewise.
     count : number of points of the outline.
     n_inner : of the inner edges.
+    gain_std : standard deviation of ``gain``, by how far the keyframes are apart on it; 0 of a single one.
     """
 
     share: float
@@ -250,6 +333,7 @@ class EdgeEvidence:
     inner_chance: float
     count: int
     n_inner: int = 0
+    gain_std: float = 0.0
 
     @property
     def total(self) -> float:
@@ -360,18 +444,15 @@ class EdgeImages:
             found = np.isfinite(offsets)
             if found.sum() < FEWEST:
                 continue
-            points, normals, away = pose.apply(seen.points[found]), seen.normals[found], offsets[found]
-            by_pose = self.camera.projection_jacobian(points) @ pose_jacobian(points, pose)
-            rows = np.einsum("pi,pij->pj", normals, by_pose) @ similarity_jacobian(pose, place, centre)
-            width = max(0.5 * reach, 1.5)
-            weights = 1.0 / (1.0 + (away / width) ** 2) ** 2 / EDGE_PX**2
-            # Neighbours share their errors: a view's edges count as so many independent points.
-            weights *= min(1.0, 40.0 / len(away))
-            a, b = rows.T @ (weights[:, None] * rows), rows.T @ (weights[:, None] * normals)
-            d = normals.T @ (weights[:, None] * normals) + np.eye(2) / SHIFT_PX**2
-            gone = b @ np.linalg.inv(d)
-            matrix += a - gone @ b.T
-            right += rows.T @ (weights * away) - gone @ (normals.T @ (weights * away))
+            points = pose.apply(seen.points[found])
+            own, by_shift, shift = edge_equations(
+                points, pose.translation, seen.normals[found], offsets[found], float(reach), self.camera.intrinsics
+            )
+            by_place = similarity_jacobian(pose, place, centre)
+            # The keyframe's own shift is eliminated.
+            own -= by_shift @ np.linalg.solve(shift, by_shift.T)
+            matrix += by_place.T @ own[:6, :6] @ by_place
+            right += by_place.T @ own[:6, 6]
         return matrix, right
 
     def evidence(self, edges: MeshEdges, place: SimilarityTransform) -> EdgeEvidence:
@@ -406,6 +487,9 @@ class EdgeImages:
         def mean(values: NDArray, rows: NDArray[np.bool_]) -> float:
             return float(np.mean(values[rows])) if rows.any() else 0.0
 
+        gains = [
+            _beyond_chance(*(mean(part, r) for part in (f, c))) for f, c, r in zip(on, chance, outline, strict=True)
+        ]
         return EdgeEvidence(
             mean(found, rim),
             mean(by_chance, rim),
@@ -413,6 +497,7 @@ class EdgeImages:
             mean(by_chance, ~rim),
             int(rim.sum()),
             int((~rim).sum()),
+            float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else 0.0,
         )
 
 

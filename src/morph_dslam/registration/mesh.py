@@ -69,9 +69,10 @@ MOST_RIVALS = 3
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
-#: does not put there; where landmarks have it, by the outline alone. Its images are believed before its edges unless
+#: does not put there, or no less than the keyframes leave open by so many standard deviations of that share (one-sided,
+#: 5 %); where landmarks have it, by the outline alone. Its images are believed before its edges unless
 #: they lose more than this part of the score.
-CONFIRMED, OUTLINE_SHOWN, LOST = 10.0, 0.5, 5.0
+CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST = 10.0, 0.5, 1.645, 5.0
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -137,8 +138,8 @@ class MeshRegistration:
 
     @property
     def _lacks_edges(self) -> bool:
-        """Whether the keyframes show too little of its outline."""
-        return self.edges is not None and self.edges.gain < OUTLINE_SHOWN
+        """Whether the keyframes show too little of its outline, beyond what they are apart on it."""
+        return self.edges is not None and self.edges.gain + ONE_SIDED * self.edges.gain_std < OUTLINE_SHOWN
 
     @property
     def ambiguous(self) -> bool:

@@ -25,6 +25,7 @@ from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
 from morph_dslam.registration.scene import View, camera_from_object, views_of
 from morph_dslam.render.rasteriser import Buffers, rasterise
+from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -156,11 +157,8 @@ class TextureComparison:
         drawn = [self._draw(image, pose) for image, pose in zip(images, poses, strict=True)]
         sights = [self._centre - pose.inverse.translation for pose in poses]
         sights = [sight / np.linalg.norm(sight) for sight in sights]
-        pairs = [
-            self._compare(drawn, a, b)
-            for a, b in permutations(range(len(drawn)), 2)
-            if sights[a] @ sights[b] >= np.cos(LARGEST_TURN)
-        ]
+        alike = [(a, b) for a, b in permutations(range(len(drawn)), 2) if sights[a] @ sights[b] >= np.cos(LARGEST_TURN)]
+        pairs = on_all_cores(lambda pair: self._compare(drawn, *pair), alike)
         return [pair for pair in pairs if pair is not None]
 
     def _draw(self, normalized: Image, pose: RigidTransform) -> _Drawn:

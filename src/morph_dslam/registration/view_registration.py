@@ -26,7 +26,8 @@ from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
-from morph_dslam.registration.view_search import InView, hypotheses, map_unit, placed, sizes_and_places
+from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
+from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]
 #: A hypothesis needs so many points of the map that agree on a unit; where those of planes count, too, this share of
@@ -168,15 +169,16 @@ class EdgeSearch:
     def _fitted_from(self, starts: Sequence[SimilarityTransform]) -> list[EdgeRegistration]:
         """Distinct places near some others, the best first."""
         few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
-        rough = []
-        for start in starts:
+
+        def rough(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
             place = few.refine(self.edges, start, self._metric, ROUGH, self._hints.clicks, self._on_it)[0]
-            rough.append((_rank(few.evidence(self.edges, place), self.points_at(place, FEW_VIEWS)), place))
-        found: list[EdgeRegistration] = []
-        for _, place in sorted(rough, key=lambda pair: -pair[0]):
-            if len(found) < N_FINE and not any(self._same(place, other.place) for other in found):
-                found.append(self._fitted(place, self._images(place), FINE))
-        return self._distinct(found)
+            return _rank(few.evidence(self.edges, place), self.points_at(place, FEW_VIEWS)), place
+
+        chosen: list[SimilarityTransform] = []
+        for _, place in sorted(on_all_cores(rough, starts), key=lambda pair: -pair[0]):
+            if len(chosen) < N_FINE and not any(self._same(place, other) for other in chosen):
+                chosen.append(place)
+        return self._distinct(on_all_cores(lambda place: self._fitted(place, self._images(place), FINE), chosen))
 
     def _polished(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
         """Distinct places, the best first, those that may be right fitted from other starts, too."""
@@ -221,16 +223,18 @@ class EdgeSearch:
 
     def _again(self, found: EdgeRegistration) -> EdgeRegistration:
         """The best place near one that was found, of those begun where each keyframe alone has the object."""
-        images, places = self._images(found.place), [found]
-        seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
-        for view in seeing:
+        images = self._images(found.place)
+
+        def from_view(view: View) -> EdgeRegistration:
             one = EdgeImages([view], self.camera)
             alone = one.refine(self.edges, found.place, True, NEAREST, self._hints.clicks)[0]
             pose = camera_from_object(view, alone)
             unit = map_unit(pose, self.edges, view, self._dense[0], self.camera)[0]
             start = placed(pose, view, unit if unit > 0.0 else alone.scale, self._metric)
-            places.append(self._fitted(start, images, NEAREST))
-        return max(places, key=lambda each: each.rank)
+            return self._fitted(start, images, NEAREST)
+
+        seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
+        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.rank)
 
     def _images(self, place: SimilarityTransform) -> EdgeImages:
         """Edges of the keyframes that see the object at a place."""
@@ -278,6 +282,10 @@ class EdgeSearch:
         return ~on_large_planes(points.positions, 0.5 * DEPTH_NOISE * float(np.median(away)))
 
     @cached_property
+    def _drawings(self) -> EdgeDrawings:
+        return EdgeDrawings.of(self.edges)
+
+    @cached_property
     def _on_it(self) -> PointsOnSurface:
         return PointsOnSurface(self._dense[0], self.surface, len(self._dense[1]))
 
@@ -300,13 +308,15 @@ class EdgeSearch:
             places = places[((places > [left, top]) & (places < [right, bottom])).all(axis=1)]
         if not len(places) or not len(sizes):
             return []
-        found = hypotheses(self.edges, view, camera, sizes, places)
+        found = hypotheses(self._drawings, self.edges, view, camera, sizes, places)
         starts = [] if found is None else self._agreeing(found, view)
-        one, ranked = EdgeImages([view], camera), []
-        for start in starts:
+        one = EdgeImages([view], camera)
+
+        def ranked(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
             place = one.refine(self.edges, start, True, QUICK, (), self._on_it)[0]
-            ranked.append((_rank(one.evidence(self.edges, place), self._points_in(place, [view])), place))
-        return [place for _, place in sorted(ranked, key=lambda pair: -pair[0])[:N_FITTED]]
+            return _rank(one.evidence(self.edges, place), self._points_in(place, [view])), place
+
+        return [place for _, place in sorted(on_all_cores(ranked, starts), key=lambda pair: -pair[0])[:N_FITTED]]
 
     def _agreeing(self, found: InView, view: View) -> list[SimilarityTransform]:
         """The best of the hypotheses by their edges and by the points of the map in their outline."""

@@ -10,8 +10,6 @@ that a cluttered print does not win by its many edges.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -25,12 +23,15 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.registration.edges import LEAST_EDGE, SHOWN, MeshEdges
 from morph_dslam.registration.scene import HasPose, MapPoints, View
+from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]
 #: Sides from which the edges are drawn, turns of each drawing in the image, points compared, and directions of edges.
 N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 48, 8
 #: The image is halved; a point meets an edge within so many of these pixels, and the drawing moves by so many.
 HALF, TOLERANCE, STEP = 2, 2.0, 4
+#: A turned drawing is left where its first points add up to nothing, or some more of them to less than this.
+FEW_POINTS, MORE_POINTS, MORE_GAIN = 6, 12, 3.0
 #: Window over which chance is measured, pixels of the halved image.
 WINDOW = 65
 #: Apparent diameters tried, over the image's height, and the factor from one to the next.
@@ -42,6 +43,8 @@ NEAR = 0.125
 DRAWN_AT, SEEN, DEPTH_PX = 4.0, 0.7, 40
 #: Hypotheses kept of each size, and side of the squares of which only the best one of each side is, pixels.
 MOST, MOST_OF_SIDE, CELL = 4000, 400, 12
+#: Hypotheses are worked on in so many parts.
+N_PARTS = 16
 #: Points of the map on the object have distances alike to this part, and at least so many give the map's unit.
 ALIKE, FEWEST_POINTS = 0.03, 4
 
@@ -113,43 +116,80 @@ def edge_gains(view: View) -> NDArray[np.float32]:
     return np.asarray(gains, dtype=np.float32)
 
 
-@njit(cache=True, nogil=True)
-def lay_over(gains, offsets, normals, turns, size, columns, rows, best, which):
+def in_phases(gains: NDArray[np.float32], margin: int) -> NDArray[np.float32]:
+    """Gains (d, h, w) with a margin of zeros, so that those at every `STEP`-th pixel are neighbours.
+
+    Returns
+    -------
+    (d, STEP, STEP, rows, columns): pixel (x, y) is at [:, v % STEP, u % STEP, v // STEP, u // STEP], where u and v are
+    ``margin`` more than x and y.
+    """
+    height, width = (int(np.ceil((side + 2 * margin) / STEP)) * STEP for side in gains.shape[1:])
+    wide = np.zeros((len(gains), height, width), np.float32)
+    wide[:, margin : margin + gains.shape[1], margin : margin + gains.shape[2]] = gains
+    split = wide.reshape(len(gains), height // STEP, STEP, width // STEP, STEP)
+    return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3))
+
+
+@njit(cache=True, nogil=True, fastmath={"nsz"})
+def lay_over(phases, margin, offsets, normals, turns, size, columns, rows, best, which):
     """Lay all drawings, turned, over places of an image, and keep the best of each side at each place.
 
     Parameters
     ----------
-    gains : (d, h, w) of `edge_gains`.
+    phases : of `in_phases`: a row of places is added in one go.
+    margin : of them; no drawing reaches farther.
     offsets : (s, p, 2) of the drawings.
     normals : (s, p) of the drawings.
     turns : number of turns.
     size : of the object, pixels.
-    columns : (k,) of the places.
-    rows : (k,) likewise.
+    columns : (k,) of the places, over `STEP`, rising in each row.
+    rows : (k,) likewise, rising.
     best : (k, s) sums of gains, filled.
     which : (k, s) int16 the turn that gives it, filled.
     """
-    n_directions, height, width = gains.shape
+    n_directions = phases.shape[0]
     n_sides, n_points = offsets.shape[:2]
     x, y, direction = np.empty(n_points, np.int64), np.empty(n_points, np.int64), np.empty(n_points, np.int64)
+    few, more = np.empty(phases.shape[4], np.float32), np.empty(phases.shape[4], np.float32)
     for side in range(n_sides):
         for turn in range(turns):
             angle = 2.0 * np.pi * turn / turns
             c, s = np.cos(angle), np.sin(angle)
             for p in range(n_points):
                 u, v = size * offsets[side, p, 0], size * offsets[side, p, 1]
-                x[p], y[p] = int(np.rint(c * u - s * v)), int(np.rint(s * u + c * v))
+                x[p], y[p] = int(np.rint(c * u - s * v)) + margin, int(np.rint(s * u + c * v)) + margin
                 direction[p] = int(np.rint((normals[side, p] + angle) / np.pi * n_directions)) % n_directions
-            for place in range(len(columns)):
-                total = 0.0
-                for p in range(n_points):
-                    column, row = columns[place] + x[p], rows[place] + y[p]
-                    if 0 <= column < width and 0 <= row < height:
-                        total += gains[direction[p], row, column]
-                    if (p == 5 and total < 0.0) or (p == 11 and total < 3.0):
-                        break
-                if total > best[place, side]:
-                    best[place, side], which[place, side] = total, turn
+            first = 0
+            while first < len(columns):
+                last = first
+                while last + 1 < len(columns) and rows[last + 1] == rows[first]:
+                    last += 1
+                row, start, count = rows[first], columns[first], columns[last] - columns[first] + 1
+                few[:count] = 0.0
+                for p in range(FEW_POINTS):
+                    line = phases[direction[p], y[p] % STEP, x[p] % STEP, row + y[p] // STEP]
+                    begin = start + x[p] // STEP
+                    for k in range(count):
+                        few[k] += line[begin + k]
+                more[:count] = few[:count]
+                for p in range(FEW_POINTS, MORE_POINTS):
+                    line = phases[direction[p], y[p] % STEP, x[p] % STEP, row + y[p] // STEP]
+                    begin = start + x[p] // STEP
+                    for k in range(count):
+                        more[k] += line[begin + k]
+                for place in range(first, last + 1):
+                    k = columns[place] - start
+                    if few[k] < 0.0 or more[k] < MORE_GAIN:
+                        continue
+                    total = more[k]
+                    for p in range(MORE_POINTS, n_points):
+                        total += phases[
+                            direction[p], y[p] % STEP, x[p] % STEP, row + y[p] // STEP, columns[place] + x[p] // STEP
+                        ]
+                    if total > best[place, side]:
+                        best[place, side], which[place, side] = total, turn
+                first = last + 1
 
 
 @dataclass(frozen=True)
@@ -209,18 +249,23 @@ class InView:
         depths = view.camera_from_world.apply(points.positions[view.point_ids])[:, 2]
         angles = 2.0 * np.pi * self.turns / N_TURNS
         distances = self.camera.fx / self.sizes
-        units, agreeing, telling_ones, others = units_by_drawings(
-            self.drawings.depths,
-            self.sides,
-            angles,
-            self.sizes,
-            self.places,
-            rays,
-            distances,
-            view.pixels,
-            depths,
-            telling[view.point_ids],
-        )
+
+        def units_of(rows: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+            return units_by_drawings(
+                self.drawings.depths,
+                self.sides[rows],
+                angles[rows],
+                self.sizes[rows],
+                self.places[rows],
+                rays[rows],
+                distances[rows],
+                view.pixels,
+                depths,
+                telling[view.point_ids],
+            )
+
+        parts = on_all_cores(units_of, np.array_split(np.arange(len(angles)), N_PARTS))
+        units, agreeing, telling_ones, others = (np.concatenate(part) for part in zip(*parts, strict=True))
         return units / self.diameter, agreeing, telling_ones, others
 
 
@@ -280,28 +325,42 @@ def units_by_drawings(drawn, sides, angles, sizes, places, rays, distances, pixe
     return units, counts[0], counts[1], counts[2]
 
 
-def hypotheses(edges: MeshEdges, view: View, camera: Camera, sizes: Array, places: Array) -> InView | None:
+def hypotheses(
+    drawings: EdgeDrawings, edges: MeshEdges, view: View, camera: Camera, sizes: Array, places: Array
+) -> InView | None:
     """Where a view may show the object; None if it has no edges.
 
     Parameters
     ----------
+    drawings : of the object.
     edges : of the object.
     view : to search.
     camera : of the view.
     sizes : apparent diameters to try, pixels.
-    places : (k, 2) pixels at which its middle may be.
+    places : (k, 2) pixels at which its middle may be, some of those of `sizes_and_places`, in their order.
     """
-    drawings = EdgeDrawings.of(edges)
     if not len(drawings.rotations):
         return None
-    gains = edge_gains(view)
     columns, rows = np.rint((places + 0.5) / HALF - 0.5).astype(np.int64).T
     cells = rows // CELL * 10000 + columns // CELL
+    margin = int(np.ceil(sizes.max() / HALF * np.linalg.norm(drawings.offsets, axis=2).max())) + 1
+    phases = in_phases(edge_gains(view), margin)
 
     def of_size(size: float) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int16], Array]:
         best = np.zeros((len(places), len(drawings.rotations)), np.float32)
         which = np.zeros(best.shape, np.int16)
-        lay_over(gains, drawings.offsets, drawings.normals, N_TURNS, size / HALF, columns, rows, best, which)
+        lay_over(
+            phases,
+            margin,
+            drawings.offsets,
+            drawings.normals,
+            N_TURNS,
+            size / HALF,
+            columns // STEP,
+            rows // STEP,
+            best,
+            which,
+        )
         # The best of each side in each square.
         order = np.argsort(-best, axis=0)[:MOST_OF_SIDE]
         kept = [order[np.unique(cells[order[:, side]], return_index=True)[1], side] for side in range(best.shape[1])]
@@ -311,8 +370,7 @@ def hypotheses(edges: MeshEdges, view: View, camera: Camera, sizes: Array, place
         at, sides = at[chosen], sides[chosen]
         return best[at, sides].astype(float), np.full(len(at), size), sides, which[at, sides], places[at]
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        found = list(threads.map(of_size, sizes.tolist()))
+    found = on_all_cores(of_size, sizes.tolist())
     gain, apparent, side, turn, place = (np.concatenate(part) for part in zip(*found, strict=True))
     centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
     return InView(drawings, centre, edges.size, camera, gain, apparent, side, turn.astype(np.int64), place)

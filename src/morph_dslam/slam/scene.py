@@ -97,9 +97,10 @@ class Scene:
     def camera_estimate(self, terms: Sequence[CameraTerm] = TERMS) -> CameraEstimate | None:
         """The camera as the recording shows it.
 
-        None where nothing tells: too few frames or points, a map that was kept as it is, or a stereo pair.
+        Where too few frames or points tell of it, all terms are unobservable. None without a path, of a map that was
+        kept as it is, and of a stereo pair.
         """
-        if self.slam is None or self.slam.frame_images.is_stereo:
+        if self.slam is None or self.slam.frame_images.is_stereo or not len(self.trajectory):
             return None
         key = tuple(terms)
         if key not in self._estimates:
@@ -292,8 +293,8 @@ def _estimated(scene: Scene, terms: Sequence[CameraTerm], name: str) -> CameraEs
     estimate = scene.camera_estimate(terms)
     if estimate is None:
         raise MapError(
-            f"the camera cannot be estimated from {name}: too few frames have a pose, or too few points are seen in "
-            "several; film a textured, rigid scene, or leave out --refine-camera"
+            f"the camera cannot be estimated from {name}: no frame has a pose; film a textured, rigid scene, or leave "
+            "out --refine-camera"
         )
     return estimate
 

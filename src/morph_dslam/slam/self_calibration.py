@@ -319,8 +319,7 @@ def _solve(views: _Views, given: Camera, unknowns: Array, free: Indices, huber_p
     width = huber_px or min(max(HUBER_RATIO * usual, LEAST_HUBER_PX), MOST_HUBER_PX)
     # The median length of two normal deviations is 1.18 of their standard deviation.
     variance = max(usual / 1.18, 0.1) ** 2
-    std = PRIOR_STD * np.where(np.isin(np.arange(N_UNKNOWNS), COLUMNS["centre"]), given.width, 1.0)
-    information = variance / std[free] ** 2
+    information = variance / _prior_std(given)[free] ** 2
 
     def cost(views: _Views, unknowns: Array) -> float:
         errors = np.linalg.norm(views.residuals(changed(given, unknowns)), axis=1)
@@ -417,8 +416,8 @@ class _Recording:
 @one_thread_for_algebra
 def estimate_camera(
     rigid_map: RigidMap, camera: Camera, path: Trajectory, seen: Sequence[Followed], terms: Sequence[CameraTerm] = TERMS
-) -> CameraEstimate | None:
-    """Terms of a camera from the frames of a recording; None where there are too few frames or points.
+) -> CameraEstimate:
+    """Terms of a camera from the frames of a recording; as known before where there are too few frames or points.
 
     Parameters
     ----------
@@ -430,7 +429,7 @@ def estimate_camera(
     terms = terms_of(camera, terms)
     recording = _Recording(rigid_map, camera, path, seen)
     if not recording.is_enough:
-        return None
+        return _as_before(camera, terms)
     free = np.array(sorted(column for term in terms for column in COLUMNS[term]))
     try:
         solution = _start(recording.views(), camera, "radial" in terms)
@@ -438,8 +437,23 @@ def estimate_camera(
             recording.take_over(solution.views, changed(camera, solution.unknowns))
             solution = _solve(recording.views(), camera, solution.unknowns, free)
     except np.linalg.LinAlgError:
-        return None  # a check must not end a run: what the frames have in common determines nothing
+        return _as_before(camera, terms)  # what the frames have in common determines nothing
     return _estimate(camera, solution, free, terms)
+
+
+def _prior_std(camera: Camera) -> Array:
+    """Standard deviations (6,) of the unknowns before anything is measured."""
+    return PRIOR_STD * np.where(np.isin(np.arange(N_UNKNOWNS), COLUMNS["centre"]), camera.width, 1.0)
+
+
+def _as_before(camera: Camera, terms: Sequence[CameraTerm]) -> CameraEstimate:
+    """The given camera, all of it unobservable."""
+    std, estimates = _prior_std(camera), dict[CameraTerm, TermEstimate]()
+    for term in terms:
+        values = _values(camera, term)
+        part = std[COLUMNS[term]] * (camera.fx if term == "focal" else 1.0)
+        estimates[term] = TermEstimate(values, values, tuple(part.tolist()), 0.0, np.inf, MATTERS[term])
+    return CameraEstimate(camera, estimates)
 
 
 def _start(views: _Views, camera: Camera, with_lens: bool) -> _Solution:

@@ -20,11 +20,13 @@ from morph_dslam.model.shown_field import Shown
 from morph_dslam.notices import Remark
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
+from morph_dslam.slam.self_calibration import camera_notes
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
 from morph_dslam.sources.frames import FrameSource, read_image
 from morph_dslam.sources.live import LiveStream, PacedRecording
 from morph_dslam.sources.local_socket import SocketCamera
 from morph_dslam.threads import one_thread_for_algebra
+from morph_dslam.tracking.camera_check import CameraCheck
 from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, write_video
@@ -198,12 +200,15 @@ class _Job:
         sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
         self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
+        self._checks = {p.name: CameraCheck(p.camera) for p in placed if _checks_camera(p, run)}
         self._log = None if run.frame_log is None else FrameLog(run.frame_log, self._folders[0])
         self._streams = self._opened_streams(stack)
         sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
         screens = self._screens(stack) if run.live else []
         if run.live:
             sinks += [self._times, *screens]
+        if self._checks:
+            sinks.append(self._keep_for_camera)
         if run.in_two_passes:
             # What is sent is final: the second pass.
             sinks.append(self._keep_seen)
@@ -244,6 +249,10 @@ class _Job:
         notices = [*part.registration.warnings, *self._again[part.name].notices]
         if part.object.scene is not None:
             notices += [Remark(note) for note in part.object.scene.camera_notes]
+        checked = self._checks[part.name].estimate() if part.name in self._checks else None
+        if checked is not None:
+            facts["camera"] = {term: found.facts() for term, found in checked.terms.items()}
+            notices += [Remark(note) for note in camera_notes(checked)]
         if part.options.use_discrepancy and part.model.stresses:
             notices.append(Remark(f"{NOT_IN_EQUILIBRIUM}; those in plots and tables are the model's without it"))
         if isinstance(self._source, SynchronizedFrames):
@@ -296,11 +305,23 @@ class _Job:
         if self._streams is not None:
             self._streams.close()
 
+    def _keep_for_camera(self, tracked: TrackedFrame) -> None:
+        """Keep where the points of each object were seen, to check the camera."""
+        for name, check in self._checks.items():
+            tracker = self._session.trackers[name]
+            if tracked.results[name].tracked and isinstance(tracker, Tracker) and tracker.last_seen is not None:
+                check.add(tracked.frame.timestamp, tracker.reference.points, tracker.last_seen)
+
     def _keep_seen(self, tracked: TrackedFrame) -> None:
         """Keep where the points of each object were seen, to refine its reference."""
         for name, tracker in self._session.trackers.items():
             if tracked.results[name].tracked and isinstance(tracker, Tracker) and tracker.last_seen is not None:
                 self._seen[name].append(tracker.last_seen)
+
+
+def _checks_camera(part: PlacedObject, run: TrackOptions) -> bool:
+    """Whether the object's points check the camera: one camera and a recording, which no map has been made of."""
+    return not run.live and not run.other_cameras and part.object.scene is None and part.options.pose != "still"
 
 
 def _shown_of(part: PlacedObject, run: TrackOptions) -> Shown | None:

@@ -1,0 +1,66 @@
+"""The camera as a tracked object shows it, where no map of the scene has checked it.
+
+The points that were followed are taken as those of a rigid object: what the estimated deformation moves them by in the
+image is taken out. Their places, the poses and the camera are then adjusted together, as for a map of a scene.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
+from morph_dslam.slam.self_calibration import CameraEstimate, estimate_camera
+from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.state import BoundPoints
+
+Array = NDArray[np.float64]
+
+
+class CameraCheck:
+    """Keeps where an object's points were seen, frame by frame, to estimate the camera from them.
+
+    Parameters
+    ----------
+    camera : as given.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._rest = np.empty((0, 3))
+        self._times: list[float] = []
+        self._world_from_camera: list[Array] = []
+        self._seen: list[Followed] = []
+
+    def add(self, timestamp: float, points: BoundPoints, seen: Keyframe) -> None:
+        """Take in a frame.
+
+        Parameters
+        ----------
+        timestamp : seconds, later than those before.
+        points : p of the first reference view, the same in all frames.
+        seen : where the frame shows them.
+        """
+        if len(points) != len(seen.pixels):
+            return
+        pose = seen.state.camera_from_object
+        deformed, rest = (
+            self._camera.project(local) for local in (points.in_camera(seen.state), pose.apply(points.rest))
+        )
+        pixels = seen.pixels - deformed + rest
+        ids = np.flatnonzero((seen.weights > 0.0) & np.isfinite(pixels).all(axis=1))
+        self._rest = points.rest
+        self._times.append(timestamp)
+        self._world_from_camera.append(pose.inverse.matrix)
+        self._seen.append(Followed(ids, pixels[ids]))
+
+    def estimate(self) -> CameraEstimate | None:
+        """The camera by all frames; None where no frame was taken in."""
+        if not self._seen:
+            return None
+        points = RigidMap()
+        points.add_points(self._rest, np.zeros((len(self._rest), 2)), 0, GOOD)
+        path = Trajectory(np.array(self._times), np.array(self._world_from_camera))
+        return estimate_camera(points, self._camera, path, self._seen)
