@@ -63,8 +63,7 @@ class ShownField:
         self._fields = {name: self._restricted(name) for name in _fields_of(model, show)}
 
     def _restricted(self, name: str) -> SeparatedField:
-        field = self._model.restrict(self._points, name)
-        return field.with_modes(field.modes.astype(np.float32))  # type: ignore[arg-type]
+        return self._model.restrict(self._points, name, np.float32)
 
     @property
     def has_sides(self) -> bool:
