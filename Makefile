@@ -21,8 +21,10 @@ demo: $(INSTALLED)
 	@echo "make demo: builds a model, films it, tracks it; minutes the first time, later runs use what is there"
 	@$(BIN)/python examples/demo/run.py
 
-# Each file of tests runs in one of two processes. What numba compiles for the tests outlives `make clean`.
-PYTEST := NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+# Each file of tests runs in one of two processes. What Python and numba compile for the tests is kept for all processes
+# that they begin, wherever Python is asked to write none, and outlives `make clean`.
+COMPILED := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba
+PYTEST := $(COMPILED) $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 # Lint runs beside the tests, which leave a core free now and then; what it finds is printed after them.
 TEST_AND_LINT = $(MAKE) --no-print-directory lint > $(VENV)/lint.log 2>&1 & lint=$$!; status=0; \

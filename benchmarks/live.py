@@ -17,7 +17,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -30,14 +30,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam import Frame, FrameResult, MorphError, TrackOptions, open_source
+from morph_dslam import Frame, MorphError, TrackOptions, open_source
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.registration import run_registration
-from morph_dslam.extend.slam import run_slam
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.drawing import AugmentedView
-from morph_dslam.tracking.sinks import LivePicture, LiveTimes, VideoSink
+from morph_dslam.tracking.sinks import LivePicture, LiveTimes, TrackedFrame, VideoSink
 from morph_dslam.tracking.track import new_session, prepare, warm_up
 from support import keep, keep_sequence
 
@@ -100,6 +99,8 @@ def large_scene(folder: Path) -> Path:
 
 def make_large(folder: Path, model: Path) -> None:
     """Render, scan and register at 1280x720, unless it was done before."""
+    from morph_dslam.extend.slam import run_slam  # with Matplotlib, which would count in the memory of live tracking
+
     sequence = folder / "recording"
     keep_sequence(large_scene(folder), model, sequence)
     camera = sequence / "camera.yaml"
@@ -147,33 +148,41 @@ def run(arguments: argparse.Namespace) -> None:
         stream = PacedRecording(BackAndForth(images, arguments.minutes))
         video = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "augmented.mp4"
         writer = stack.enter_context(VideoWriter(video, FPS, (seal.camera.width, seal.camera.height)))
-        record, times, results = Timed(VideoSink(writer, FPS)), LiveTimes(), []
+        record, times = Timed(VideoSink(writer, FPS)), LiveTimes()
+        # Not the results, whose memory would grow with the minutes.
+        counts, stages = Counter[str](), defaultdict[str, list[float]](list)
+
+        def note(tracked: TrackedFrame) -> None:
+            result = tracked.results[seal.name]
+            counts[str(result.status)] += 1
+            for stage, milliseconds in result.timings_ms.items():
+                stages[stage].append(milliseconds)
+
         picture = LivePicture(seal.camera, {seal.name: AugmentedView(seal.model, seal.camera)})
-        sinks = [times, record, lambda tracked: results.append(tracked.results[seal.name])]
-        session = new_session(placed, stream, sinks, picture=picture)
+        session = new_session(placed, stream, [times, record, note], picture=picture)
         picture.draw, session.locate, session.track = map(Timed, (picture.draw, session.locate, session.track))
         begin = time.process_time()
         session.run()
         spent = 1e3 * (time.process_time() - begin)
     timed = {"locate": session.locate, "track": session.track, "draw": picture.draw, "record": record}
-    report(results, times, session.n_dropped, spent, timed)
+    report(times, timed, spent)
+    print(
+        "wall time by stage [ms]: " + ", ".join(f"{k} {m:.1f}" for k, v in stages.items() if (m := np.median(v)) > 0.05)
+    )
+    print(f"drawn frames: {len(times.frames)}, {dict(counts)}")
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    print(
+        f"fps={times.fps:.2f} dropped={session.n_dropped} latency_median_ms={times.latency_ms(50):.1f} "
+        f"latency_p95_ms={times.latency_ms(95):.1f} memory_MB={memory:.0f}"
+    )
 
 
-def report(results: list[FrameResult], times: LiveTimes, n_dropped: int, spent: float, timed: dict[str, Timed]) -> None:
-    """Print processor time by thread and by stage, how it went, and the result line."""
+def report(times: LiveTimes, timed: dict[str, Timed], spent: float) -> None:
+    """Print processor time by thread."""
     print(f"\n{'processor time [ms]':<22}{'median':>8}{'p95':>8}")
     for name, one in timed.items():
         print(f"{name:<22}{np.median(one.milliseconds):>8.1f}{np.percentile(one.milliseconds, 95):>8.1f}")
     print(f"{'all, a drawn frame':<22}{spent / max(len(times.frames), 1):>8.1f}")
-    stages = {stage: np.median([result.timings_ms[stage] for result in results]) for stage in results[0].timings_ms}
-    print("wall time by stage [ms]: " + ", ".join(f"{k} {v:.1f}" for k, v in stages.items() if v > 0.05))
-    counts = Counter(str(result.status) for result in results)
-    print(f"drawn frames: {len(results)}, {dict(counts)}")
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    print(
-        f"fps={times.fps:.2f} dropped={n_dropped} latency_median_ms={times.latency_ms(50):.1f} "
-        f"latency_p95_ms={times.latency_ms(95):.1f} memory_MB={memory:.0f}"
-    )
 
 
 def main() -> int:

@@ -72,6 +72,7 @@ def test_a_model_in_a_metric_scene_keeps_its_scale():
     points, views = scanned(METRIC, with_images=True)
     rigid_map = RigidMap(baseline_px=40.0)
     rigid_map.add_points(points.positions, np.zeros((len(points), 2)), 0, GOOD)
+    views = views[1::2]  # enough, the last one among them
     for view in views:
         pose = view.camera_from_world.matrix
         rigid_map.add_keyframe(Keyframe(view.frame, 0.0, view.normalized, pose, view.point_ids, view.pixels))

@@ -104,7 +104,7 @@ def write_field(group: h5py.Group, field: SeparatedField) -> None:
     _write_functions(group.create_group("functions"), field.functions)
 
 
-def _write_single(group: h5py.Group, name: str, values: Array) -> None:
+def _write_single(group: h5py.Group, name: str, values: NDArray[np.floating]) -> None:
     with np.errstate(over="ignore"):
         single = values.astype(np.float32)
     if not np.isfinite(single).all():

@@ -265,9 +265,14 @@ class ReducedModel:
         corners, weights = self._interpolation(points)
         return np.einsum("pc,pcx->px", weights, self.nodes[corners])
 
-    def restrict(self, points: SurfacePoints | MaterialPoints, name: str = "displacement") -> SeparatedField:
-        """The field called ``name`` in `fields` at these points only."""
-        return self.fields[name].restrict(*self._interpolation(points))
+    def restrict(
+        self,
+        points: SurfacePoints | MaterialPoints,
+        name: str = "displacement",
+        precision: type[np.floating] = np.float64,
+    ) -> SeparatedField:
+        """The field called ``name`` in `fields` at these points only, its modes in this precision."""
+        return self.fields[name].restrict(*self._interpolation(points), precision)
 
 
 @dataclass(frozen=True)

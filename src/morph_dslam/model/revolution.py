@@ -35,9 +35,13 @@ MOST_HARMONICS = 12
 #: Products of a function and a harmonic that are this part of the largest one, all together, are left out; how large a
 #: function becomes is seen at so many states.
 PRODUCTS_LEFT_OUT, SAMPLES = 2e-3, 256
+#: Nodes whose modes are turned at a time.
+NODES_AT_A_TIME = 2048
 
 
-def with_revolution_angle(model: ReducedModel, direction: Array, name: str = "turn") -> ReducedModel:
+def with_revolution_angle(
+    model: ReducedModel, direction: Array, name: str = "turn", precision: type[np.floating] = np.float64
+) -> ReducedModel:
     """The model with the angle about an axis as its last parameter, from -360 to 360 degrees, default 0.
 
     Reactions, which belong to sets that need not turn with the mesh, are left out.
@@ -45,6 +49,8 @@ def with_revolution_angle(model: ReducedModel, direction: Array, name: str = "tu
     Parameters
     ----------
     direction : (3,) roughly that of the axis, object frame; the nodes themselves say where it is exactly.
+    name : of the angle.
+    precision : of the modes. Single is that of a model file, and halves the memory of what has many harmonics.
 
     Raises
     ------
@@ -64,7 +70,7 @@ def with_revolution_angle(model: ReducedModel, direction: Array, name: str = "tu
         name, "angle", "deg", -2.0 * np.pi, 2.0 * np.pi, 0.0, "angle about the axis from which it is loaded"
     )
     fields = {
-        key: _turned(field, images, direction, key)
+        key: _turned(field, images, direction, key, precision)
         for key, field in model.fields.items()
         if field.modes.shape[1] == len(model.nodes)
     }
@@ -109,31 +115,36 @@ def _node_images(nodes: Array, point: Array, direction: Array) -> NDArray[np.int
     return images
 
 
-def _turned(field: SeparatedField, images: NDArray[np.int64], direction: Array, name: str) -> SeparatedField:
+def _turned(
+    field: SeparatedField, images: NDArray[np.int64], direction: Array, name: str, precision: type[np.floating]
+) -> SeparatedField:
     """A field of vectors (3 components) or symmetric tensors (6) with the angle as its last parameter."""
     count = len(images)
     angles = 2.0 * np.pi * np.arange(count) / count
     turns = [_component_turn(angle, direction, field.modes.shape[2], name) for angle in angles]
     basis = fourier_basis(0.0, 2.0 * np.pi, min(MOST_HARMONICS, (count - 1) // 2))
     table = np.array([np.ravel(basis.evaluate(angle)) for angle in angles])
-    # One mode at a time: all of them at all angles would be the largest array of a session.
+    # Some nodes at a time: all of them at all angles would be the largest array of a session.
     to_harmonics = np.linalg.pinv(table)
-    modes = np.empty((field.n_modes, basis.size, *field.modes.shape[1:]))
+    modes = np.empty((field.n_modes, basis.size, *field.modes.shape[1:]), dtype=precision)
     for mode, harmonics in zip(field.modes, modes, strict=True):
-        turned = np.stack([mode[image] @ turn.T for image, turn in zip(images, turns, strict=True)])
-        harmonics[:] = np.tensordot(to_harmonics, turned, axes=1)
+        for begin in range(0, len(mode), NODES_AT_A_TIME):
+            part = slice(begin, begin + NODES_AT_A_TIME)
+            turned = np.stack([mode[image[part]] @ turn.T for image, turn in zip(images, turns, strict=True)])
+            harmonics[:, part] = np.tensordot(to_harmonics, turned, axes=1)
     kept = _harmonics_needed(modes)
     basis, modes = fourier_basis(0.0, 2.0 * np.pi, kept), modes[:, : 1 + 2 * kept]
     unit = np.eye(basis.size)
     around = CPFunctions((basis,), (unit,), unit)
     needed = _products_needed(field.functions, modes)
     functions = ProductFunctions(field.functions, around).mixed(np.eye(modes.shape[0] * modes.shape[1])[:, needed])
-    return SeparatedField(modes.reshape(-1, *field.modes.shape[1:])[needed], functions)
+    product, harmonic = np.divmod(needed, modes.shape[1])
+    return SeparatedField(modes[product, harmonic], functions)
 
 
-def _harmonics_needed(modes: Array) -> int:
+def _harmonics_needed(modes: NDArray[np.floating]) -> int:
     """The least number of harmonics beyond which no mode (m, 1 + 2 h, ...) has more than a small part."""
-    energy = np.sum(modes.reshape(*modes.shape[:2], -1) ** 2, axis=2)
+    energy = np.array([[np.sum(part**2, dtype=np.float64) for part in mode] for mode in modes])
     energy[:, 0] *= 2.0  # the mean square of a cosine is a half, that of the constant is 1
     total = energy.sum(axis=1, keepdims=True)
     beyond = np.sqrt(np.cumsum(energy[:, ::-1], axis=1)[:, ::-1] / total).max(axis=0)
@@ -141,7 +152,7 @@ def _harmonics_needed(modes: Array) -> int:
     return int(small[0]) if small.size else modes.shape[1] // 2
 
 
-def _products_needed(functions: Functions, modes: Array) -> NDArray[np.int64]:
+def _products_needed(functions: Functions, modes: NDArray[np.floating]) -> NDArray[np.int64]:
     """Which products (k,) of a function and a harmonic, in order, have more than a small part of the field.
 
     Without the others it differs by less than `PRODUCTS_LEFT_OUT` of the largest one, wherever and at whatever
@@ -155,8 +166,7 @@ def _products_needed(functions: Functions, modes: Array) -> NDArray[np.int64]:
     shares = np.random.default_rng(0).random((SAMPLES, functions.dimension))
     states = np.concatenate([[lower, upper], lower + shares * (upper - lower)])
     largest = np.max([np.abs(functions.rows(state)[0]) for state in states], axis=0)
-    parts = modes.reshape(*modes.shape[:2], -1)
-    sizes = (largest[:, None] * np.maximum(parts.max(axis=2), -parts.min(axis=2))).ravel()
+    sizes = (largest[:, None] * [[max(part.max(), -part.min()) for part in mode] for mode in modes]).ravel()
     order = np.argsort(sizes)
     small = np.cumsum(sizes[order]) <= PRODUCTS_LEFT_OUT * sizes.max()
     return np.sort(order[~small])

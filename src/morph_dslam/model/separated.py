@@ -39,6 +39,8 @@ def combine_modes(rows, modes):
     return result
 
 
+#: Numbers at the corners of points that are made at a time.
+_MOST_AT_CORNERS = 1 << 21
 #: Numbers that are added up at a time: they stay in the processor's nearest memory meanwhile.
 _AT_A_TIME = 384
 
@@ -87,11 +89,12 @@ class SeparatedField:
 
     Attributes
     ----------
-    modes : (n_modes, n_points, n_components), the functions F_i at the points, in the field's SI unit.
+    modes : (n_modes, n_points, n_components), the functions F_i at the points, in the field's SI unit; in double or
+        single precision, sums are in double but for `placed`.
     functions : the n_modes functions H_i, in any format.
     """
 
-    modes: Array
+    modes: NDArray[np.floating]
     functions: Functions
 
     @property
@@ -128,8 +131,8 @@ class SeparatedField:
         rotation, translation : (3, 3), and (3,) in the field's unit.
         """
         row = self.functions.rows(self._state(mu, "bounded"))[0]
-        rest, modes, rotation, translation = map(np.ascontiguousarray, (rest, self.modes, rotation, translation))
-        return placed_points(row, rest, modes, rotation, translation)
+        rest, rotation, translation = map(np.ascontiguousarray, (rest, rotation, translation))
+        return placed_points(row, rest, np.ascontiguousarray(self.modes), rotation, translation)
 
     def value_and_sensitivities(self, mu: ArrayLike, outside: Outside = "bounded") -> tuple[Array, Array]:
         """The field (n_points, n_components) and its derivatives (d, n_points, n_components).
@@ -141,16 +144,25 @@ class SeparatedField:
         result = result.reshape(len(rows), *self.modes.shape[1:])
         return result[0], result[1:]
 
-    def with_modes(self, modes: Array) -> SeparatedField:
+    def with_modes(self, modes: NDArray[np.floating]) -> SeparatedField:
         """The same functions with other modes (n_modes, any points, any components)."""
         return SeparatedField(np.ascontiguousarray(modes), self.functions)
 
-    def restrict(self, corners: NDArray[np.integer], weights: Array) -> SeparatedField:
+    def restrict(
+        self, corners: NDArray[np.integer], weights: Array, precision: type[np.floating] = np.float64
+    ) -> SeparatedField:
         """The same field at p points interpolated from mesh nodes.
 
         Parameters
         ----------
         corners : (p, c) node indices.
         weights : (p, c) interpolation weights.
+        precision : of the modes at the points.
         """
-        return self.with_modes(np.einsum("pc,mpcx->mpx", weights, self.modes[:, corners]))
+        modes = np.empty((self.n_modes, len(corners), self.modes.shape[2]), precision)
+        # Not all modes of many points at once: at their corners these would be several times as large as the result.
+        step = max(1, _MOST_AT_CORNERS // max(corners.size * modes.shape[2], 1))
+        for begin in range(0, self.n_modes, step):
+            part = slice(begin, begin + step)
+            np.einsum("pc,mpcx->mpx", weights, self.modes[part][:, corners], out=modes[part], casting="same_kind")
+        return self.with_modes(modes)

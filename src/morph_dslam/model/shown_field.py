@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -50,6 +51,8 @@ SHOWN: dict[Shown, ShownKind] = {
 class ShownField:
     """A field at points of a model, and their displacement, in single precision: as exact as the model file.
 
+    Both are kept for the last parameters asked for, so that all who show a frame evaluate them once.
+
     Parameters
     ----------
     model : that holds the field.
@@ -61,10 +64,10 @@ class ShownField:
         self._model, self._points, self._show = model, points, show
         self._displacement = self._restricted("displacement")
         self._fields = {name: self._restricted(name) for name in _fields_of(model, show)}
+        self._last: dict[str, tuple[Array, Array]] = {}
 
     def _restricted(self, name: str) -> SeparatedField:
-        field = self._model.restrict(self._points, name)
-        return field.with_modes(field.modes.astype(np.float32))  # type: ignore[arg-type]
+        return self._model.restrict(self._points, name, np.float32)
 
     @property
     def has_sides(self) -> bool:
@@ -73,7 +76,7 @@ class ShownField:
 
     def displacement(self, parameters: Array) -> Array:
         """(n, 3), metres."""
-        return self._displacement.value(parameters)
+        return self._kept("displacement", parameters, self._displacement.value)
 
     def values(self, parameters: Array, displacement: Array, side: Literal["top", "bottom"] | None = None) -> Array:
         """The field (n,) in the unit of its `ShownKind`; NaN for a rigid object.
@@ -88,12 +91,24 @@ class ShownField:
             return np.full(len(displacement), np.nan)
         if self._show == "displacement":
             return 1e3 * np.linalg.norm(displacement, axis=1)
-        if self._show == "strain":
-            return 100.0 * equivalent_strain(self._fields["strain"].value(parameters))
-        if self._show == "traction":
-            return 1e-3 * np.linalg.norm(self._fields["traction"].value(parameters), axis=1)
         names = list(self._fields) if side is None else [f"stress_{side}"]
-        return 1e-6 * np.max([von_mises(self._fields[name].value(parameters)) for name in names], axis=0)
+        return np.max([self._kept(name, parameters, partial(self._size, name)) for name in names], axis=0)
+
+    def _size(self, name: str, parameters: Array) -> Array:
+        """What is shown (n,) of a field."""
+        field = self._fields[name].value(parameters)
+        if self._show == "strain":
+            return 100.0 * equivalent_strain(field)
+        if self._show == "traction":
+            return 1e-3 * np.linalg.norm(field, axis=1)
+        return 1e-6 * von_mises(field)
+
+    def _kept(self, name: str, parameters: Array, evaluate: Callable[[Array], Array]) -> Array:
+        """What was evaluated for the same parameters last, whichever thread did it, or now."""
+        kept = self._last.get(name)
+        if kept is None or not np.array_equal(kept[0], parameters):
+            kept = self._last[name] = np.array(parameters), evaluate(parameters)
+        return kept[1]
 
     def range_of(self, fields: Sequence[Array]) -> tuple[float, float]:
         """One range of colours for values (n,) of several states; from 0 to 1 for a rigid object."""

@@ -312,7 +312,7 @@ def registration_in_map(
     last = max(keyframes, key=lambda view: view.frame)
     open_angles: tuple[str, ...] = ()
     if axis is not None:
-        model = with_revolution_angle(model, axis.direction)
+        model = with_revolution_angle(model, axis.direction, precision=np.float32)
         open_angles = (model.parameters[-1].name,)
         warnings = [*(w for w in warnings if not isinstance(w, AngleOpen)), AngleOpen(*open_angles)]
     of_pose = map_registration.pose_covariance(last.pose) if last.covariance is None else last.covariance

@@ -1,7 +1,7 @@
 """Rasterising meshes: which triangle each pixel shows, where on it, and at which depth, in compiled loops.
 
-Edge functions decide coverage (Pineda 1988). They are linear in the image, so along a row each is the value
-at the first pixel plus so many steps.
+Edge functions decide coverage (Pineda 1988). They are linear in the image, so each is the value at a triangle's first
+pixel plus so many steps along its rows and columns.
 """
 
 from __future__ import annotations
@@ -19,60 +19,64 @@ LEAST_AREA = 1e-12
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def load_triangle(pixels, depths, triangles, t, closed, u, v, inverse_depth):
-    """Load the corners of triangle ``t`` into u, v and inverse_depth, all (3,).
+def pack_nodes(pixels, depths):
+    """Column, row and inverse depth of nodes (n, 3), side by side in memory; NaN where not in front of the camera.
 
     Parameters
     ----------
-    pixels, depths, triangles, closed : see `rasteriser.rasterise`.
-
-    Returns
-    -------
-    Twice its area in the image, squared pixels, negative where the corners run anticlockwise; 0 if it is not
-    to be drawn: a corner is not in front of the camera, or it is turned away or degenerate.
+    pixels, depths : see `rasterise`.
     """
-    ahead = True
-    for corner in range(3):
-        node = triangles[t, corner]
-        ahead &= depths[node] > 0.0 and np.isfinite(pixels[node, 0] + pixels[node, 1])
-        u[corner], v[corner] = pixels[node, 0], pixels[node, 1]
-    area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
-    is_drawn = ahead and abs(area) > LEAST_AREA and not (closed and area >= 0.0)
-    if is_drawn:
-        for corner in range(3):
-            inverse_depth[corner] = 1.0 / depths[triangles[t, corner]]
-    return area if is_drawn else 0.0
+    nodes = np.full((len(depths), 3), np.nan)
+    for k in range(len(depths)):
+        if depths[k] > 0.0 and np.isfinite(pixels[k, 0] + pixels[k, 1]):
+            nodes[k, 0], nodes[k, 1], nodes[k, 2] = pixels[k, 0], pixels[k, 1], 1.0 / depths[k]
+    return nodes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pixel_window(u, v, height, width):
-    """First and last column, first and last row, of the pixels that a triangle may cover; it may be none."""
+def pixel_window(nodes, triangle, closed, height, width):
+    """First and last column, first and last row, of the pixels that a triangle may cover.
+
+    There are none, that is a last one before the first, if it is not to be drawn: a corner is not in front of the
+    camera, or it is turned away or degenerate.
+
+    Parameters
+    ----------
+    nodes : (n, 3), see `pack_nodes`.
+    triangle : (3,) its corners.
+    closed, height, width : see `rasterise`.
+    """
+    i, j, k = triangle[0], triangle[1], triangle[2]
+    u0, u1, u2, v0, v1, v2 = nodes[i, 0], nodes[j, 0], nodes[k, 0], nodes[i, 1], nodes[j, 1], nodes[k, 1]
+    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+    if (closed and area >= 0.0) or not abs(area) > LEAST_AREA:
+        return 0, -1, 0, -1
     # Clamp before the conversion: a corner just in front of the camera lies far outside any integer.
-    left = int(np.ceil(max(min(u[0], u[1], u[2]), 0.0)))
-    right = int(np.floor(min(max(u[0], u[1], u[2]), width - 1.0)))
-    top = int(np.ceil(max(min(v[0], v[1], v[2]), 0.0)))
-    bottom = int(np.floor(min(max(v[0], v[1], v[2]), height - 1.0)))
-    return left, right, top, bottom
+    left, right = int(np.ceil(max(min(u0, u1, u2), 0.0))), int(np.floor(min(max(u0, u1, u2), width - 1.0)))
+    top, bottom = int(np.ceil(max(min(v0, v1, v2), 0.0))), int(np.floor(min(max(v0, v1, v2), height - 1.0)))
+    return left, right, top, bottom if left <= right else top - 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def weights_at(u, v, area, column, row):
-    """Weights of the first two corners at a pixel, in the image plane."""
-    b0 = ((u[1] - column) * (v[2] - row) - (u[2] - column) * (v[1] - row)) / area
-    b1 = ((u[2] - column) * (v[0] - row) - (u[0] - column) * (v[2] - row)) / area
-    return b0, b1
+def corner_weights(nodes, triangle, column, row):
+    """Weights of a triangle's first two corners at a pixel, and by how much they grow to the next column and row.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def weight_steps(v, area):
-    """By how much the weights of the first two corners grow from one pixel to the next in its row."""
-    return (v[1] - v[2]) / area, (v[2] - v[0]) / area
+    Parameters
+    ----------
+    nodes, triangle : see `pixel_window`.
+    """
+    i, j, k = triangle[0], triangle[1], triangle[2]
+    u0, u1, u2, v0, v1, v2 = nodes[i, 0], nodes[j, 0], nodes[k, 0], nodes[i, 1], nodes[j, 1], nodes[k, 1]
+    share = 1.0 / ((u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0))
+    b0 = ((u1 - column) * (v2 - row) - (u2 - column) * (v1 - row)) * share
+    b1 = ((u2 - column) * (v0 - row) - (u0 - column) * (v2 - row)) * share
+    return b0, b1, (v1 - v2) * share, (v2 - v0) * share, (u2 - u1) * share, (u0 - u2) * share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def is_inside(b0, b1, b2):
     """Whether a pixel with these weights is covered."""
-    return b0 >= -EDGE_TOLERANCE and b1 >= -EDGE_TOLERANCE and b2 >= -EDGE_TOLERANCE
+    return min(b0, b1, b2) >= -EDGE_TOLERANCE
 
 
 Array = NDArray[np.float64]
@@ -100,35 +104,29 @@ class Buffers:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_triangle(triangle_id, area, u, v, q, triangle_ids, weights, depth):
-    """Draw one triangle: twice its area, and its corners' pixels u, v and inverse depths q, all (3,)."""
-    left, right, top, bottom = pixel_window(u, v, *depth.shape)
-    if left > right or top > bottom:  # it lies between the centres of pixels
-        return
-    step0, step1 = weight_steps(v, area)
-    for row in range(top, bottom + 1):
-        first0, first1 = weights_at(u, v, area, left, row)
-        for column in range(left, right + 1):
-            b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
-            b2 = 1.0 - b0 - b1
-            if not is_inside(b0, b1, b2):
-                continue
-            z = 1.0 / (b0 * q[0] + b1 * q[1] + b2 * q[2])
-            if z < depth[row, column]:
-                depth[row, column] = z
-                triangle_ids[row, column] = triangle_id
-                weights[row, column, 0] = b0 * q[0] * z
-                weights[row, column, 1] = b1 * q[1] * z
-                weights[row, column, 2] = b2 * q[2] * z
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _fill_triangles(pixels, depths, triangles, closed, triangle_ids, weights, depth):
-    u, v, q = np.empty(3), np.empty(3), np.empty(3)
+    nodes = pack_nodes(pixels, depths)
     for t in range(triangles.shape[0]):
-        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
-        if area != 0.0:
-            _fill_triangle(t, area, u, v, q, triangle_ids, weights, depth)
+        triangle = triangles[t]
+        left, right, top, bottom = pixel_window(nodes, triangle, closed, *depth.shape)
+        if bottom < top:
+            continue
+        b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
+        q0, q1, q2 = nodes[triangle[0], 2], nodes[triangle[1], 2], nodes[triangle[2], 2]
+        for row in range(top, bottom + 1):
+            b0_left, b1_left = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
+            for column in range(left, right + 1):
+                b0, b1 = b0_left + (column - left) * b0_right, b1_left + (column - left) * b1_right
+                b2 = 1.0 - b0 - b1
+                if not is_inside(b0, b1, b2):
+                    continue
+                z = 1.0 / (b0 * q0 + b1 * q1 + b2 * q2)
+                if z < depth[row, column]:
+                    depth[row, column] = z
+                    triangle_ids[row, column] = t
+                    weights[row, column, 0] = b0 * q0 * z
+                    weights[row, column, 1] = b1 * q1 * z
+                    weights[row, column, 2] = b2 * q2 * z
 
 
 def rasterise(
@@ -174,23 +172,22 @@ def draw_depth(pixels, depths, triangles, closed, height, width):
     """
     triangle_ids = np.full((height, width), -1, np.int32)
     depth = np.full((height, width), np.float32(np.inf), np.float32)
-    u, v, q = np.empty(3), np.empty(3), np.empty(3)
+    nodes = pack_nodes(pixels, depths)
     for t in range(triangles.shape[0]):
-        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
-        if area == 0.0:
+        triangle = triangles[t]
+        left, right, top, bottom = pixel_window(nodes, triangle, closed, height, width)
+        if bottom < top:
             continue
-        left, right, top, bottom = pixel_window(u, v, height, width)
-        if left > right or top > bottom:
-            continue
-        step0, step1 = weight_steps(v, area)
+        b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
+        q0, q1, q2 = nodes[triangle[0], 2], nodes[triangle[1], 2], nodes[triangle[2], 2]
         for row in range(top, bottom + 1):
-            first0, first1 = weights_at(u, v, area, left, row)
+            b0_left, b1_left = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
             for column in range(left, right + 1):
-                b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
+                b0, b1 = b0_left + (column - left) * b0_right, b1_left + (column - left) * b1_right
                 b2 = 1.0 - b0 - b1
                 if not is_inside(b0, b1, b2):
                     continue
-                z = np.float32(1.0 / (b0 * q[0] + b1 * q[1] + b2 * q[2]))
+                z = np.float32(1.0 / (b0 * q0 + b1 * q1 + b2 * q2))
                 if z < depth[row, column]:
                     depth[row, column] = z
                     triangle_ids[row, column] = t

@@ -69,12 +69,12 @@ class DrawnSurface:
         used, triangles = np.unique(model.triangles, return_inverse=True)
         triangles = triangles.reshape(model.triangles.shape)
         nodes = model.nodes[used]
-        modes = model.displacement.modes[:, used].astype(np.float32)
+        modes = model.displacement.modes[:, used].astype(np.float32, copy=False)
         drawn = replace(
             model,
             nodes=nodes,
             triangles=triangles,
-            displacement=model.displacement.with_modes(modes),  # type: ignore[arg-type]
+            displacement=model.displacement.with_modes(modes),
             stresses={},
             cells={},
             strain=None,

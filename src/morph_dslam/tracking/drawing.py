@@ -210,11 +210,17 @@ class AugmentedView:
         self._camera, self._inner, self._model, self._bar = camera, inner, model, BarPlace()
         self.show: Shown = shown_field(model, options.show)
         points, self._triangles = _drawn_mesh(model, options.section)
-        self._closed = options.section is None and DrawnSurface.of(model).closed
+        self._whole = options.section is None
+        self._closed = self._whole and DrawnSurface.of(model).closed
         self._alpha = SEE_THROUGH if inner else OPACITY if options.section is None else CUT_OPEN
         self._rest = model.rest_positions(points)
         self._field = ShownField(model, points, self.show)
         self._arrows = ForceArrows(model) if options.forces else None
+
+    @property
+    def surface_field(self) -> ShownField | None:
+        """What colours the whole surface; None where a plane cuts it open."""
+        return self._field if self._whole else None
 
     @property
     def label(self) -> str:

@@ -100,7 +100,7 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
             residuals[j, 0], residuals[j, 1] = n0 * along, n1 * along
         if weights[j] == 0.0:
             continue
-        length = np.hypot(residuals[j, 0], residuals[j, 1])
+        length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
         weight = weights[j]
         if length <= huber:
             cost += weight * 0.5 * length * length
@@ -112,13 +112,13 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
             for a in range(size):
                 slope = n0 * jacobian[0, a] + n1 * jacobian[1, a]
                 jacobian[0, a], jacobian[1, a] = n0 * slope, n1 * slope
+        across, down = jacobian[0], jacobian[1]
         for a in range(size):
-            gradient[a] += weight * (jacobian[0, a] * residuals[j, 0] + jacobian[1, a] * residuals[j, 1])
-            for b in range(a + 1):
-                hessian[a, b] += weight * (jacobian[0, a] * jacobian[0, b] + jacobian[1, a] * jacobian[1, b])
-    for a in range(size):
-        for b in range(a):
-            hessian[b, a] = hessian[a, b]
+            first, second, row = weight * across[a], weight * down[a], hessian[a]
+            gradient[a] += first * residuals[j, 0] + second * residuals[j, 1]
+            # Whole rows are what the compiler vectorizes: less than the time of half of each.
+            for b in range(size):
+                row[b] += first * across[b] + second * down[b]
     return cost, hessian, gradient, residuals
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,5 +57,10 @@ class StateTerm:
         """(d + 6,) in standard deviations; the camera does not matter."""
         turned = pose_increment(self.state.camera_from_object, state.camera_from_object)
         away = np.concatenate([state.parameters - self.state.parameters, turned])
+        return np.asarray(self._whitening @ away)
+
+    @cached_property
+    def _whitening(self) -> Array:
+        """The matrix (d + 6, d + 6) that turns what a state is away by into standard deviations."""
         values, vectors = np.linalg.eigh(self.covariance / np.outer(self.scale, self.scale))
-        return np.asarray((vectors.T @ (away / self.scale)) / np.sqrt(np.maximum(values, LEAST_VARIANCE)))
+        return (vectors / np.sqrt(np.maximum(values, LEAST_VARIANCE))).T / self.scale

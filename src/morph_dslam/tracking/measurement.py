@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.render.rasteriser import (
-    is_inside,
-    load_triangle,
-    pixel_window,
-    visible_points,
-    weight_steps,
-    weights_at,
-)
+from morph_dslam.render.rasteriser import corner_weights, is_inside, pack_nodes, pixel_window, visible_points
 from morph_dslam.tracking.binding import Drawing, View, facing, signed_areas
 from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
 
@@ -103,35 +96,16 @@ class ReferenceAppearance:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_triangle(triangle_id, area, u, v, q, corners, texture, image, depth, triangle_ids):
-    """Draw one triangle: twice its area, its corners' pixels u, v and inverse depths q (3,), and where they are in the
-    texture, ``corners`` (3, 3)."""
-    x, y, h = corners[:, 0], corners[:, 1], corners[:, 2]
+def _grey_at(texture, x, y):
+    """Grey level of a texture at a place, bilinearly; outside it is its border."""
     last_row, last_column = texture.shape[0] - 1, texture.shape[1] - 1
-    left, right, top, bottom = pixel_window(u, v, *depth.shape)
-    step0, step1 = weight_steps(v, area)
-    for row in range(top, bottom + 1):
-        first0, first1 = weights_at(u, v, area, left, row)
-        for column in range(left, right + 1):
-            b0, b1 = first0 + (column - left) * step0, first1 + (column - left) * step1
-            b2 = 1.0 - b0 - b1
-            if not is_inside(b0, b1, b2):
-                continue
-            w0, w1, w2 = b0 * q[0], b1 * q[1], b2 * q[2]
-            z = 1.0 / (w0 + w1 + w2)
-            if not z < depth[row, column]:
-                continue
-            depth[row, column], triangle_ids[row, column] = z, triangle_id
-            # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
-            scale = 1.0 / (w0 * h[0] + w1 * h[1] + w2 * h[2])
-            s = min(max((w0 * x[0] + w1 * x[1] + w2 * x[2]) * scale, 0.0), last_column)
-            t = min(max((w0 * y[0] + w1 * y[1] + w2 * y[2]) * scale, 0.0), last_row)
-            s0, t0 = int(s), int(t)
-            s1, t1 = min(s0 + 1, last_column), min(t0 + 1, last_row)
-            a, b = s - s0, t - t0
-            above = (1.0 - a) * texture[t0, s0] + a * texture[t0, s1]
-            below = (1.0 - a) * texture[t1, s0] + a * texture[t1, s1]
-            image[row, column] = np.uint8((1.0 - b) * above + b * below + 0.5)
+    s, t = min(max(x, 0.0), last_column), min(max(y, 0.0), last_row)
+    s0, t0 = int(s), int(t)
+    s1, t1 = min(s0 + 1, last_column), min(t0 + 1, last_row)
+    a, b = s - s0, t - t0
+    above = (1.0 - a) * texture[t0, s0] + a * texture[t0, s1]
+    below = (1.0 - a) * texture[t1, s0] + a * texture[t1, s1]
+    return np.uint8((1.0 - b) * above + b * below + 0.5)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -147,12 +121,32 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     image, depth, triangle_ids : (h, w) uint8, float32, the unit of ``depths``, and int32; changed where the surface is
         nearest.
     """
-    u, v, q = np.empty(3), np.empty(3), np.empty(3)
+    nodes = pack_nodes(pixels, depths)
     for t in range(triangles.shape[0]):
-        area = load_triangle(pixels, depths, triangles, t, closed, u, v, q)
-        if area == 0.0:
+        triangle = triangles[t]
+        left, right, top, bottom = pixel_window(nodes, triangle, closed, *depth.shape)
+        if bottom < top:
             continue
-        _draw_triangle(t, area, u, v, q, coordinates[t], texture, image, depth, triangle_ids)
+        b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
+        q0, q1, q2 = nodes[triangle[0], 2], nodes[triangle[1], 2], nodes[triangle[2], 2]
+        corners = coordinates[t]
+        for row in range(top, bottom + 1):
+            b0_left, b1_left = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
+            for column in range(left, right + 1):
+                b0, b1 = b0_left + (column - left) * b0_right, b1_left + (column - left) * b1_right
+                b2 = 1.0 - b0 - b1
+                if not is_inside(b0, b1, b2):
+                    continue
+                w0, w1, w2 = b0 * q0, b1 * q1, b2 * q2
+                z = 1.0 / (w0 + w1 + w2)
+                if not z < depth[row, column]:
+                    continue
+                depth[row, column], triangle_ids[row, column] = z, t
+                # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
+                scale = 1.0 / (w0 * corners[0, 2] + w1 * corners[1, 2] + w2 * corners[2, 2])
+                x = (w0 * corners[0, 0] + w1 * corners[1, 0] + w2 * corners[2, 0]) * scale
+                y = (w0 * corners[0, 1] + w1 * corners[1, 1] + w2 * corners[2, 1]) * scale
+                image[row, column] = _grey_at(texture, x, y)
 
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.

@@ -49,7 +49,9 @@ class MultiObjectTracker:
 
     def __init__(self, trackers: Mapping[str, Tracker | RigTracker]) -> None:
         self.trackers = dict(trackers)
-        self._surfaces = {name: DrawnSurface.of(tracker.model).model for name, tracker in self.trackers.items()}
+        # One object alone occludes nothing.
+        several = self.trackers if len(self.trackers) > 1 else {}
+        self._surfaces = {name: DrawnSurface.of(tracker.model).model for name, tracker in several.items()}
         self._last: dict[str, FrameResult] = {}
 
     def track(

@@ -138,7 +138,8 @@ def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
     elif name in model.supports:
         held = model.supports[name]
         rest = model.nodes[held].mean(axis=0)
-        moved = model.displacement.with_modes(model.displacement.modes[:, held].mean(axis=1, keepdims=True))
+        middle = model.displacement.modes[:, held].mean(axis=1, keepdims=True, dtype=np.float64)
+        moved = model.displacement.with_modes(middle)
 
         def place(mu: Array) -> tuple[Array, Array]:
             value, slopes = value_of(moved)(mu)

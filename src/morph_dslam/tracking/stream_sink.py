@@ -45,12 +45,14 @@ class StreamedObject:
     name : that streams call it by; that of its tracker if empty.
     show : what colours it; None for the stress of a model that has it, else the displacement.
     modulus_std : standard deviation of a factor common to all moduli: it counts in the reactions.
+    field : what colours the surface, where it is drawn as well; None to make one.
     """
 
     model: ReducedModel
     name: str = ""
     show: Shown | None = None
     modulus_std: float = 0.0
+    field: ShownField | None = None
 
 
 class StreamSink:
@@ -142,7 +144,7 @@ class _ObjectMessages:
         points, triangles = surface_points(model)
         kind = shown_field(model, streamed.show)
         self._rest, self._modulus_std = model.rest_positions(points), streamed.modulus_std
-        self._field, self._reactions = ShownField(model, points, kind), Reactions(model)
+        self._field, self._reactions = streamed.field or ShownField(model, points, kind), Reactions(model)
         self._covers_jumps, self._si_factor = kind == "displacement", SHOWN[kind].si_factor
         self.info = ObjectInfo(
             name,

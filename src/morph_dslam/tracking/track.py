@@ -295,8 +295,10 @@ class _Job:
         if self._streams is None:
             return []
         objects = {
-            part.name: StreamedObject(part.model, name, _shown_of(part, self._run), part.options.modulus_std)
-            for part, name in zip(placed, self._run.stream_names, strict=True)
+            part.name: StreamedObject(
+                part.model, name, _shown_of(part, self._run), part.options.modulus_std, view.surface_field
+            )
+            for part, name, view in zip(placed, self._run.stream_names, self._views, strict=True)
         }
         return [self._streams.begin(objects, placed[0].camera)]
 
