@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.couplings import MOTIONS, CoupledSet, Coupling
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import LinearSolver, SolverMaker, TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation
 
 Array = NDArray[np.float64]
@@ -123,14 +123,14 @@ class CoupledSolid(SolidProblem):
         forces[self._following] = (x[: self.n_unknowns] - placed)[self._following]
         return self._with_motions(forces, unbalanced)
 
-    def solver_of(self, free: Mask) -> LinearSolver:
+    def solver_of(self, free: Mask, make: SolverMaker | None = None) -> TangentSolver:
+        make = make or partial(LinearSolver, threads=self.options.threads)
         inside = free[: self.n_unknowns] & self.assembly.coupled
         inside[self._following] = False
-        return _Solver(free, inside, self.assembly.symmetric, self.options.threads)
+        return make(inside, self.assembly.symmetric, all_free=free)
 
-    def linearise(self, x: Array, mu: Array, solver: LinearSolver | None = None) -> Linearisation:
+    def linearise(self, x: Array, mu: Array, solver: TangentSolver | None = None) -> Linearisation:
         solver = solver or self.solver
-        assert isinstance(solver, _Solver)
         self._set(mu)
         placed = self._placed(x)
         inner = super().linearise(placed, mu, solver)
@@ -196,14 +196,6 @@ class CoupledSolid(SolidProblem):
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:
     return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
-
-
-class _Solver(LinearSolver):
-    """Of the solid's dofs ``inside`` that follow no coupling, with the ``all_free`` ones of solid and couplings."""
-
-    def __init__(self, all_free: Mask, inside: Mask, symmetric: bool, threads: int | None) -> None:
-        super().__init__(inside, symmetric, threads)
-        self.all_free = all_free
 
 
 @dataclass(frozen=True)

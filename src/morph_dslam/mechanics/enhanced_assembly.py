@@ -42,7 +42,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid_assembly import Assembly, Term, threads
 from morph_dslam.mechanics.solid_materials import MaterialRegion, can_be_mixed
 from morph_dslam.mechanics.solvers.cellwise import CellwiseLinearisation, PointwiseLinearisation
-from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation
 from morph_dslam.mechanics.spaces import DisplacementSpace
 
@@ -319,7 +319,7 @@ class EnhancedAssembly:
         np.add.at(data, place, matrix.data[source])
 
     def linearise(
-        self, x: Array, mu: Array, residual: Array, solver: LinearSolver, contact: sp.csr_matrix | None = None
+        self, x: Array, mu: Array, residual: Array, solver: TangentSolver, contact: sp.csr_matrix | None = None
     ) -> Linearisation:
         """See `solid_assembly.Assembly.linearise`."""
         state, cells = self._deformed(x), self._cells()

@@ -28,7 +28,7 @@ from morph_dslam.mechanics.shell_recovery import ShellRecovery
 from morph_dslam.mechanics.shell_supports import HoldsDirection
 from morph_dslam.mechanics.solid import SolidProblem, Support
 from morph_dslam.mechanics.solid_assembly import Assembly, Term
-from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation
 from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.mechanics.supports import Constraints, ElasticFoundation
@@ -232,7 +232,7 @@ class ShellProblem(SolidProblem):
         self._state.vec.FV().NumPy()[:] = x
         self._normals.update()
 
-    def linearise(self, x: Array, mu: Array, solver: LinearSolver | None = None) -> Linearisation:
+    def linearise(self, x: Array, mu: Array, solver: TangentSolver | None = None) -> Linearisation:
         """Tangent at ``x``; the frozen edge normals are averaged there first.
 
         That renewal shifts the meaning of the edges' rotations, which the next correction makes up for.

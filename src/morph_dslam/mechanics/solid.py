@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import ngsolve as ngs
@@ -34,7 +34,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.recovery import Recovery
 from morph_dslam.mechanics.solid_assembly import Assembly, Term
 from morph_dslam.mechanics.solid_materials import can_be_mixed, mixed_materials, owners_of_cells, place_materials
-from morph_dslam.mechanics.solvers.linear_solver import LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import LinearSolver, SolverMaker, TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation, State
 from morph_dslam.mechanics.spaces import DisplacementSpace, default_order
 from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion
@@ -248,13 +248,14 @@ class SolidProblem:
         return free
 
     @cached_property
-    def solver(self) -> LinearSolver:
+    def solver(self) -> TangentSolver:
         """The linear solver, made when first needed."""
         return self.solver_of(self.free)
 
-    def solver_of(self, free: NDArray[np.bool_]) -> LinearSolver:
-        """A linear solver of the ``free`` (n_dofs,) dofs."""
-        return LinearSolver(free & self.assembly.coupled, self.assembly.symmetric, threads=self.options.threads)
+    def solver_of(self, free: NDArray[np.bool_], make: SolverMaker | None = None) -> TangentSolver:
+        """A linear solver of the ``free`` (n_dofs,) dofs; ``make`` makes another one than `LinearSolver`."""
+        make = make or partial(LinearSolver, threads=self.options.threads)
+        return make(free & self.assembly.coupled, self.assembly.symmetric, all_free=free)
 
     def initial_state(self) -> State:
         """The undeformed solid at the parameters' defaults: where every path starts."""
@@ -280,7 +281,7 @@ class SolidProblem:
         self._latest = x.copy(), np.array(mu), residual
         return residual
 
-    def linearise(self, x: Array, mu: Array, solver: LinearSolver | None = None) -> Linearisation:
+    def linearise(self, x: Array, mu: Array, solver: TangentSolver | None = None) -> Linearisation:
         """See `newton.Equations`; ``solver``, in place of the solid's own, holds part of the free dofs too."""
         # Newton's method has mostly just asked for the residual at the same point.
         known = self._latest

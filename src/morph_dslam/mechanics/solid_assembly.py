@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.mechanics.contact_assembly import added
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solvers.condensation import Condensation, CondensedLinearisation
-from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
+from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ class Assembly:
         return result
 
     def linearise(
-        self, x: Array, mu: Array, residual: Array, solver: LinearSolver, contact: sp.csr_matrix | None = None
+        self, x: Array, mu: Array, residual: Array, solver: TangentSolver, contact: sp.csr_matrix | None = None
     ) -> Linearisation:
         """Tangent at ``x``, with the ``residual`` (n,) there; ``mu`` is set already.
 
@@ -170,7 +170,7 @@ class _MixedLinearisation(AssembledLinearisation):
     pressures (Haynsworth, Linear Algebra and its Applications 1, 1968).
     """
 
-    def __init__(self, residual: Array, matrix: sp.csr_matrix, solver: LinearSolver, multipliers: int) -> None:
+    def __init__(self, residual: Array, matrix: sp.csr_matrix, solver: TangentSolver, multipliers: int) -> None:
         super().__init__(residual, matrix, solver)
         self._multipliers = multipliers
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,9 @@ from morph_dslam.mechanics.loads import with_reactions
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
+from morph_dslam.mechanics.solvers.linear_solver import SolverMaker
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
+from morph_dslam.mechanics.solvers.two_level import LowerOrder, TwoLevelSolver
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.reduced_model import REACTION
 from morph_dslam.reduction.certificate import field_errors
@@ -48,6 +50,9 @@ QUANTILES = (1.0, 0.5, 0.75, 0.25, 0.9)
 #: dissection has 2 and 4/3 in the limit).
 FINER_TANGENTS, SWEEP_TANGENTS, TIME_POWER, MEMORY_POWER = 3.5, 3.0, 1.5, 4.0 / 3.0
 BYTES_OF_A_MILLION = 45e9
+#: The same of an iterative solve: time in units of a tangent of the study's elements and of the ratio of unknowns
+#: (measured on a seal of 287 thousand), memory of an unknown (6 kB on that seal, 12 kB on hexahedra of third order).
+ITERATIVE_TANGENTS, ITERATIVE_BYTES = 6.0, 12e3
 #: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
 TOLERANCE, PART = 1e-2, 0.03
 
@@ -111,7 +116,7 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
     solves = len(snapshots.training) + len(snapshots.held_out)
     finer = HigherOrder(sweep.problem, _finer(study, sweep.problem))
     chosen = chosen_states(snapshots.held_out, study.sampling.refined)
-    chosen = chosen[: _affordable(_unknowns(sweep.problem, finer.problem), solves)]
+    chosen = chosen[: _affordable(_unknowns(sweep.problem, finer.problem), solves, finer.iterative)]
     kept = {index: load_state(snapshots.held_out_files[index]) for index in chosen}
     # Where solutions were found on disk, this build was shorter than the one that solved them.
     solving = SWEEP_TANGENTS * _tangent_seconds(sweep.problem, kept[chosen[0]]) * solves / (study.work.workers or 1)
@@ -134,16 +139,17 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
     )
 
 
-def _affordable(unknowns: list[int], solves: int) -> int:
+def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
     """How many finer states a quarter of a build of ``solves`` can afford; ``unknowns`` are those of `_unknowns`.
 
     Raises _NotEstimated where memory or time allow none.
     """
     own, finer = unknowns
-    memory = BYTES_OF_A_MILLION * (1e-6 * finer) ** MEMORY_POWER
+    memory = ITERATIVE_BYTES * finer if iterative else _direct_bytes(finer)
     if memory > MOST_BYTES:
         raise _NotEstimated(f"{finer} unknowns of finer elements would need about {1e-9 * memory:.0f} GB of memory")
-    time_of_one = FINER_TANGENTS / SWEEP_TANGENTS * (finer / own) ** TIME_POWER
+    tangents = ITERATIVE_TANGENTS * finer / own if iterative else FINER_TANGENTS * (finer / own) ** TIME_POWER
+    time_of_one = tangents / SWEEP_TANGENTS
     count = int(SHARE / (1.0 - SHARE) * solves / time_of_one)
     if count < 1:
         raise _NotEstimated(
@@ -151,6 +157,11 @@ def _affordable(unknowns: list[int], solves: int) -> int:
             f"{solves} solves, more than a quarter of the build"
         )
     return count
+
+
+def _direct_bytes(unknowns: int) -> float:
+    """Memory of a direct solve."""
+    return BYTES_OF_A_MILLION * (1e-6 * unknowns) ** MEMORY_POWER
 
 
 def _finer(study: SolidStudy, coarse: SolidProblem) -> SolidProblem:
@@ -185,10 +196,17 @@ class HigherOrder:
     ----------
     coarse : the solid.
     problem : the same solid with elements of higher order.
+
+    Attributes
+    ----------
+    iterative : whether its tangents are too large to be factorised, so that `TwoLevelSolver` has to do. That is for
+        displacements alone: pressures that cells share make the tangent indefinite.
     """
 
     def __init__(self, coarse: SolidProblem, problem: SolidProblem) -> None:
         self._coarse, self.problem = coarse, problem
+        n = 3 * problem.displacements.n_scalar
+        self.iterative = _direct_bytes(n) > MOST_BYTES and not problem.assembly.coupled[n:].any()
         self._latest: State | None = None
 
     def solve(self, dofs: Array, mu: Array, in_time: Callable[[], bool] = lambda: True) -> State:
@@ -205,12 +223,15 @@ class HigherOrder:
         SolverError
             If no solution is found.
         """
-        equations, given = _Stoppable(self.problem, in_time), self._embedded(dofs)
+        make = partial(TwoLevelSolver, lower=self._lower_order(dofs, mu)) if self.iterative else None
+        equations, given = _Stoppable(self.problem, in_time, make), self._embedded(dofs)
         try:
-            state = solve(_Added(self.problem, in_time, self._kept, given), mu, State(mu, given), TOLERANCE)
+            state = solve(_Added(self.problem, in_time, self._kept, given, make), mu, State(mu, given), TOLERANCE)
             tolerance = PART * size(equations, state.dofs - given)
             state = solve(equations, mu, state, tolerance)
         except SolverError:
+            if self.iterative:
+                raise  # a path would take as long as many states
             start = self._latest or loaded_state(equations, self.problem.symbols.default)
             state = advance(equations, start, mu, PART * TOLERANCE)[-1]
         self._latest = state
@@ -220,6 +241,12 @@ class HigherOrder:
     def _kept(self) -> NDArray[np.bool_]:
         """The dofs (n,) that the coarse solid has too."""
         return self._embedded(np.ones(self._coarse.n_dofs)) != 0.0
+
+    def _lower_order(self, dofs: Array, mu: Array) -> LowerOrder:
+        """The coarse solid's tangent at its solution ``dofs`` (n,)."""
+        numbers = self._embedded(np.arange(1.0, self._coarse.n_dofs + 1.0))[: self.problem.n_unknowns]
+        kept = np.flatnonzero(numbers)
+        return LowerOrder(self._coarse.linearise(dofs, mu), numbers[kept].astype(np.int64) - 1, kept)
 
     def _embedded(self, dofs: Array) -> Array:
         """The displacement of a coarse solution, and the motions of its couplings, as dofs (n,) of the finer solid."""
@@ -234,13 +261,13 @@ class HigherOrder:
 class _Stoppable:
     """The equations of a solid, whose factorisations stop when time is up."""
 
-    def __init__(self, problem: SolidProblem, in_time: Callable[[], bool]) -> None:
+    def __init__(self, problem: SolidProblem, in_time: Callable[[], bool], make: SolverMaker | None) -> None:
         self._problem, self._in_time = problem, in_time
         self.n_dofs, self.free, self.scale = problem.n_dofs, problem.free, problem.scale
         self.in_contact, self.applied_first = problem.in_contact, problem.applied_first
         self.prescribed, self.prescribed_slopes = problem.prescribed, problem.prescribed_slopes
         self.residual, self.residual_slopes = problem.residual, problem.residual_slopes
-        self._solver = problem.solver
+        self._solver = problem.solver_of(problem.free, make) if make else problem.solver
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
         if not self._in_time():
@@ -252,12 +279,17 @@ class _Added(_Stoppable):
     """The same with the ``kept`` (n,) dofs held as in ``given`` (n,)."""
 
     def __init__(
-        self, problem: SolidProblem, in_time: Callable[[], bool], kept: NDArray[np.bool_], given: Array
+        self,
+        problem: SolidProblem,
+        in_time: Callable[[], bool],
+        kept: NDArray[np.bool_],
+        given: Array,
+        make: SolverMaker | None,
     ) -> None:
-        super().__init__(problem, in_time)
+        super().__init__(problem, in_time, make)
         self._kept, self._given = kept, given
         self.free, self.prescribed = problem.free & ~kept, self._held
-        self._solver = problem.solver_of(self.free)
+        self._solver = problem.solver_of(self.free, make)
 
     def _held(self, mu: Array) -> Array:
         prescribed = self._problem.prescribed(mu)

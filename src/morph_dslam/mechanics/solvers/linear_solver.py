@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import os
 import weakref
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Protocol
 
 import ngsolve as ngs
 import numpy as np
@@ -310,37 +311,97 @@ class Factorisation:
         return bool(np.all(remaining <= np.maximum(RESIDUAL_TOLERANCE * size, rounding)))
 
 
-class LinearSolver:
-    """Factorises matrices that share their free dofs, one at a time.
+class Solved(Protocol):
+    """One matrix, ready to be solved with: a `Factorisation`, or what an iterative method has prepared."""
+
+    @property
+    def current(self) -> bool:
+        """Whether this is still the solver's latest one; an older one must not be used."""
+        ...
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """Number of negative eigenvalues of K_ff; None if it is not known."""
+        ...
+
+    def solve(self, right: Array) -> Array:
+        """K_ff^-1 right_f for (n,) or (k, n), zero at prescribed dofs."""
+        ...
+
+
+class TangentSolver(ABC):
+    """Solves with matrices that share their free dofs, one at a time.
 
     Parameters
     ----------
     free : (n,) dofs that are solved for.
     symmetric : whether the matrices are (then one triangle of them is enough).
+    all_free : free dofs of the equations, where these have more than the matrices; None if they do not.
+
+    Attributes
+    ----------
+    latest : the matrix that can be solved with.
+    """
+
+    def __init__(self, free: NDArray[np.bool_], symmetric: bool, all_free: NDArray[np.bool_] | None = None) -> None:
+        self.free, self.symmetric = np.asarray(free, dtype=bool), symmetric
+        self.all_free = self.free if all_free is None else all_free
+        self.latest: Solved | None = None
+        self._triangle: tuple[Integers, bool] | None = None
+
+    @abstractmethod
+    def factorise(self, data: Array, indices: Integers, indptr: Integers) -> Solved:
+        """Take the free block of K, given in CSR form with sorted indices.
+
+        A symmetric K may come whole or as its lower or upper triangle. Raises SolverError if an entry is not finite.
+        """
+
+    def is_triangle(self, matrix: Matrix) -> bool:
+        """Whether only one triangle of ``matrix`` is stored; looked at once for each array of columns."""
+        if self._triangle is None or not np.may_share_memory(self._triangle[0], matrix.indices):
+            one_sided = sp.triu(matrix, 1).nnz == 0 or sp.tril(matrix, -1).nnz == 0
+            self._triangle = matrix.indices, one_sided
+        return self._triangle[1]
+
+
+class SolverMaker(Protocol):
+    """Makes a `TangentSolver` of given dofs."""
+
+    def __call__(self, free: NDArray[np.bool_], symmetric: bool, *, all_free: NDArray[np.bool_]) -> TangentSolver: ...
+
+
+class LinearSolver(TangentSolver):
+    """Factorises the matrices.
+
+    Parameters
+    ----------
+    free : see `TangentSolver`.
+    symmetric : see `TangentSolver`.
     threads : of PARDISO; None leaves MKL's own choice.
     engine : "pardiso" or "sparsecholesky"; None for `default_engine`. Unsymmetric matrices go to SuperLU where PARDISO
         is not used, since `sparsecholesky` reads one triangle only.
+    all_free : see `TangentSolver`.
     """
 
     def __init__(
-        self, free: NDArray[np.bool_], symmetric: bool, threads: int | None = None, engine: str | None = None
+        self,
+        free: NDArray[np.bool_],
+        symmetric: bool,
+        threads: int | None = None,
+        engine: str | None = None,
+        all_free: NDArray[np.bool_] | None = None,
     ) -> None:
-        self.free, self.symmetric = np.asarray(free, dtype=bool), symmetric
+        super().__init__(free, symmetric, all_free)
         if (engine or default_engine()) == "pardiso":
             self.engine: _Engine = Pardiso(symmetric, threads)
         else:
             self.engine = _SparseCholesky() if symmetric else SuperLU(triangular=False)
         self._block: _FreeBlock | None = None
         self._pattern: tuple[Integers, Integers] | None = None
-        self._triangle: tuple[Integers, bool] | None = None
         self._substitute: SuperLU | None = None
-        self.latest: Factorisation | None = None
 
     def factorise(self, data: Array, indices: Integers, indptr: Integers) -> Factorisation:
-        """Factorise the free block of K, given in CSR form with sorted indices.
-
-        A symmetric K may come whole or as its lower or upper triangle. Raises SolverError if an entry is not finite.
-        """
+        """See `TangentSolver`."""
         if not np.all(np.isfinite(data)):
             raise SolverError("the tangent matrix is not finite: the deformation is too large or inside out")
         block = self._block_of(indices, indptr)
@@ -348,8 +409,8 @@ class LinearSolver:
         self._substitute = None
         if matrix.shape[0]:
             self.engine.factorise(matrix)
-        self.latest = Factorisation(self, matrix, block.triangular)
-        return self.latest
+        factorisation = self.latest = Factorisation(self, matrix, block.triangular)
+        return factorisation
 
     def _block_of(self, indices: Integers, indptr: Integers) -> _FreeBlock:
         """The free block's pattern, worked out again only when K's pattern has changed."""
@@ -362,13 +423,6 @@ class LinearSolver:
             self._block = _FreeBlock.of(indices, indptr, self.free, self.symmetric)
             self._pattern = np.array(indices), np.array(indptr)
         return self._block
-
-    def is_triangle(self, matrix: Matrix) -> bool:
-        """Whether only one triangle of ``matrix`` is stored; looked at once for each array of columns."""
-        if self._triangle is None or not np.may_share_memory(self._triangle[0], matrix.indices):
-            one_sided = sp.triu(matrix, 1).nnz == 0 or sp.tril(matrix, -1).nnz == 0
-            self._triangle = matrix.indices, one_sided
-        return self._triangle[1]
 
     def engines_to_try(self, matrix: Matrix) -> Iterator[_Engine]:
         """The engine, then (lazily, once for each matrix) SuperLU in its place."""
@@ -389,12 +443,12 @@ class AssembledLinearisation:
     solver : shared by the linearisations of one problem, so that PARDISO's analysis is kept.
     """
 
-    def __init__(self, residual: Array, matrix: Matrix, solver: LinearSolver) -> None:
+    def __init__(self, residual: Array, matrix: Matrix, solver: TangentSolver) -> None:
         self.residual, self._matrix, self._solver = residual, matrix, solver
-        self._factorisation: Factorisation | None = None
+        self._factorisation: Solved | None = None
         self._triangular = solver.symmetric and solver.is_triangle(matrix)
 
-    def _factorised(self) -> Factorisation:
+    def _factorised(self) -> Solved:
         if self._factorisation is None or not self._factorisation.current:
             matrix = self._matrix
             self._factorisation = self._solver.factorise(matrix.data, matrix.indices, matrix.indptr)
