@@ -49,6 +49,8 @@ from morph_dslam.tracking.patches import patch_correlation
 Array = NDArray[np.float64]
 #: Maps that a camera is estimated from, each made with the estimate before.
 REFINING_RUNS = 2
+#: Terms of which a small departure is nearly a turn of the camera.
+LIKE_A_TURN: tuple[CameraTerm, ...] = ("centre", "tangential")
 #: What is called with each undistorted image (h, w[, 3]) and what it gave.
 Watch = Callable[[NDArray[np.uint8], SlamFrame], None]
 
@@ -253,8 +255,8 @@ def refine_camera(
     """A camera's intrinsics, lens and readout time from a recording of a rigid scene.
 
     The scene is mapped, the camera estimated, and both once more with what was found. Terms that the recording does not
-    show stay as given, and the principal point unless the recording refutes it: it is nearly a turn of the camera, so
-    that a small departure is worth little and spoils the other terms.
+    show stay as given, and principal point and tangential terms unless the recording refutes them: both are nearly a
+    turn of the camera, so that a small departure is worth little and spoils the other terms.
 
     Parameters
     ----------
@@ -275,10 +277,10 @@ def refine_camera(
         scene = map_scene(opened, refined, options, progress)
         estimate = _estimated(scene, free, opened.name)
         _take_in(terms_found, estimate)
-        if number == 0 and "centre" in free and not estimate.terms["centre"].is_refuted:
-            free.remove("centre")
+        while number == 0 and (kept := _least_refuted(estimate, free)) is not None:
+            free.remove(kept)
             if not free:
-                break
+                return CameraEstimate(camera, terms_found)
             estimate = _estimated(scene, free, opened.name)
             _take_in(terms_found, estimate)
         hidden: list[CameraTerm] = [term for term in free if not estimate.terms[term].is_observable]
@@ -297,6 +299,12 @@ def _estimated(scene: Scene, terms: Sequence[CameraTerm], name: str) -> CameraEs
             "out --refine-camera"
         )
     return estimate
+
+
+def _least_refuted(estimate: CameraEstimate, free: Sequence[CameraTerm]) -> CameraTerm | None:
+    """That of `LIKE_A_TURN` which the recording refutes least, if it does not."""
+    kept = [term for term in LIKE_A_TURN if term in free and not estimate.terms[term].is_refuted]
+    return min(kept, key=lambda term: estimate.terms[term].departure / estimate.terms[term].departure_std, default=None)
 
 
 def _take_in(terms: dict[CameraTerm, TermEstimate], estimate: CameraEstimate) -> None:
