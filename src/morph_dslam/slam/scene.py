@@ -303,7 +303,7 @@ def _estimated(scene: Scene, terms: Sequence[CameraTerm], name: str) -> CameraEs
 
 def _least_refuted(estimate: CameraEstimate, free: Sequence[CameraTerm]) -> CameraTerm | None:
     """That of `LIKE_A_TURN` which the recording refutes least, if it does not."""
-    kept = [term for term in LIKE_A_TURN if term in free and not estimate.terms[term].is_refuted]
+    kept: list[CameraTerm] = [term for term in LIKE_A_TURN if term in free and not estimate.terms[term].is_refuted]
     return min(kept, key=lambda term: estimate.terms[term].departure / estimate.terms[term].departure_std, default=None)
 
 
