@@ -117,6 +117,21 @@ def test_what_is_drawn_is_carried_along_and_coloured():
     assert not changed[:200, :100].any()
 
 
+@pytest.mark.parametrize(("show", "of_one"), [("stress", 1.0), ("strain", 20.0)])
+def test_what_is_shown_follows_the_state(show, of_one):
+    """Of u = mu X, with the stress mu MPa and the strain 0.3 mu along x, whatever was asked for before."""
+    field = AugmentedView(closed(stretching_block()), CAMERA, DrawOptions(show)).surface_field
+    parameters = np.zeros(3)  # the same array anew, as who reuses one would
+    for stretch in (0.5, 0.5, 0.25, 0.5):
+        parameters[0] = stretch
+        displacement = field.displacement(parameters)
+        assert np.ptp(displacement, axis=0) == pytest.approx(0.1 * stretch, rel=1e-5)
+        assert field.values(parameters, displacement) == pytest.approx(of_one * stretch, rel=1e-5)
+    assert (
+        AugmentedView(stretching_block(), CAMERA, DrawOptions(show, SectionPlane.parse("x=30"))).surface_field is None
+    )
+
+
 def test_what_cannot_be_drawn_is_said():
     model = stretching_block()
     with pytest.raises(TrackingError, match=r"'x>3' is no section: write x=12"):

@@ -300,6 +300,24 @@ class TensorTrainFunctions(TensorFunctions):
         return replace(self, cores=(first, *self.cores[1:]))
 
 
+@njit(cache=True, nogil=True)
+def product_rows(first, second):
+    """Values and derivatives (1 + d + e, m n) of all products of functions of d and of e parameters.
+
+    Parameters
+    ----------
+    first, second : (1 + d, m) and (1 + e, n), values and derivatives of the functions.
+    """
+    m, n, d = first.shape[1], second.shape[1], first.shape[0]
+    rows = np.empty((d + second.shape[0] - 1, m * n))
+    for k in range(len(rows)):
+        ours, theirs = first[k if k < d else 0], second[0 if k < d else k - d + 1]
+        for i in range(m):
+            for j in range(n):
+                rows[k, i * n + j] = ours[i] * theirs[j]
+    return rows
+
+
 @dataclass(frozen=True)
 class ProductFunctions(Functions):
     """All products H_i(mu) K_j(nu), function i n_second + j, or linear combinations of them.
@@ -332,17 +350,14 @@ class ProductFunctions(Functions):
         mixing = 0 if self.mixing is None else self.mixing.size
         return self.first.n_floats + self.second.n_floats + mixing
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Array, Array]:
         lower, upper = zip(self.first.bounds, self.second.bounds, strict=True)
         return np.concatenate(lower), np.concatenate(upper)
 
     def _compiled(self, mu: Array) -> Array:
         split = self.first.dimension
-        first, second = self.first.rows(mu[:split]), self.second.rows(mu[split:])
-        by_first = np.einsum("ki,j->kij", first, second[0])
-        by_second = np.einsum("i,kj->kij", first[0], second[1:])
-        rows = np.concatenate([by_first, by_second]).reshape(1 + len(mu), -1)
+        rows = product_rows(self.first.rows(mu[:split]), self.second.rows(mu[split:]))
         return rows if self.mixing is None else rows @ self.mixing
 
     def mixed(self, matrix: Array) -> Self:

@@ -106,12 +106,10 @@ class Prior:
         hessian[:d, :d], gradient[:d] = self.information, self.information @ away
         cost = 0.5 * float(away @ gradient[:d])
         if self.pose is not None and self.pose_information is not None:
-            away = pose_increment(self.pose, state.camera_from_object)
-            slope = np.eye(6)
-            slope[:3, :3] = _log_slope(away[:3])
-            push = self.pose_information @ away
-            hessian[d:, d:], gradient[d:] = slope.T @ self.pose_information @ slope, slope.T @ push
-            cost += 0.5 * float(away @ push)
+            known, pose = self.pose, state.camera_from_object
+            arrays = (self.pose_information, known.rotation, known.translation, pose.rotation, pose.translation)
+            of_pose, hessian[d:, d:], gradient[d:] = _pose_terms(*map(np.ascontiguousarray, arrays))
+            cost += of_pose
         return cost, hessian, gradient
 
     def placed(self, state: State) -> State:
@@ -150,3 +148,20 @@ def _log_slope(turn):
     cross[1, 0], cross[2, 0], cross[2, 1] = turn[2], -turn[1], turn[0]
     c = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
     return np.eye(3) - 0.5 * cross + c * cross @ cross
+
+
+@njit(cache=True, nogil=True)
+def _pose_terms(information, known_rotation, known_translation, rotation, translation):
+    """Cost, Hessian (6, 6) and gradient (6,) by the increment of a pose that is known to be another.
+
+    Parameters
+    ----------
+    information : (6, 6), symmetric.
+    known_rotation, known_translation : (3, 3) and (3,) of the known pose.
+    rotation, translation : of the pose.
+    """
+    away, slope = np.empty(6), np.eye(6)
+    away[:3], away[3:] = rotation_log(rotation @ known_rotation.T), translation - known_translation
+    slope[:3, :3] = _log_slope(away[:3])
+    push = information @ away
+    return 0.5 * (away @ push), slope.T @ information @ slope, slope.T @ push
