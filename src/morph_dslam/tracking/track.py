@@ -33,6 +33,7 @@ from morph_dslam.tracking.frame_estimation import temporal_facts
 from morph_dslam.tracking.frame_log import FrameLog
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
+from morph_dslam.tracking.outcomes import ModelDoesNotExplain
 from morph_dslam.tracking.placement import (
     FramesAt,
     PlacedObject,
@@ -254,7 +255,7 @@ class _Job:
         if part.object.scene is not None:
             notices += [Remark(note) for note in part.object.scene.camera_notes]
         checked = self._checks[part.name].estimate() if part.name in self._checks else None
-        if part.model.parameters and folder.results.beyond_model.any():
+        if part.model.parameters and _leaves_residuals(folder.results):
             checked = None  # what the model leaves may be its own error as well as the camera's
         if checked is not None:
             facts["camera"] = {term: found.facts() for term, found in checked.terms.items()}
@@ -328,6 +329,11 @@ class _Job:
 def _checks_camera(part: PlacedObject, run: TrackOptions) -> bool:
     """Whether the object's points check the camera: one camera and a recording, which no map has been made of."""
     return not run.live and not run.other_cameras and part.object.scene is None and part.options.pose != "still"
+
+
+def _leaves_residuals(results: RunResults) -> bool:
+    """Whether the model does not explain some of the frames."""
+    return any(result.warning(ModelDoesNotExplain) is not None for result in results.results)
 
 
 def _shown_of(part: PlacedObject, run: TrackOptions) -> Shown | None:
