@@ -1,7 +1,9 @@
 """The camera as a tracked object shows it, where no map of the scene has checked it.
 
 The points that were followed are taken as those of a rigid object: what the estimated deformation moves them by in the
-image is taken out. Their places, the poses and the camera are then adjusted together, as for a map of a scene.
+image is taken out. Their places, the poses and the camera are then adjusted together, as for a map of a scene. What a
+model of a deformation is off by looks like a wrong principal point or lens: an object that deforms checks the focal
+length and the readout time only.
 """
 
 from __future__ import annotations
@@ -12,11 +14,13 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
-from morph_dslam.slam.self_calibration import CameraEstimate, estimate_camera
+from morph_dslam.slam.self_calibration import TERMS, CameraEstimate, CameraTerm, estimate_camera
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints
 
 Array = NDArray[np.float64]
+#: What an object that deforms can check.
+OF_DEFORMABLE: tuple[CameraTerm, ...] = ("focal", "readout")
 
 
 class CameraCheck:
@@ -25,10 +29,11 @@ class CameraCheck:
     Parameters
     ----------
     camera : as given.
+    deforms : whether the object has parameters.
     """
 
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
+    def __init__(self, camera: Camera, deforms: bool) -> None:
+        self._camera, self._terms = camera, OF_DEFORMABLE if deforms else TERMS
         self._rest = np.empty((0, 3))
         self._times: list[float] = []
         self._world_from_camera: list[Array] = []
@@ -63,4 +68,4 @@ class CameraCheck:
         points = RigidMap()
         points.add_points(self._rest, np.zeros((len(self._rest), 2)), 0, GOOD)
         path = Trajectory(np.array(self._times), np.array(self._world_from_camera))
-        return estimate_camera(points, self._camera, path, self._seen)
+        return estimate_camera(points, self._camera, path, self._seen, self._terms)

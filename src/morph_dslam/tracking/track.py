@@ -34,6 +34,7 @@ from morph_dslam.tracking.frame_estimation import temporal_facts
 from morph_dslam.tracking.frame_log import FrameLog
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
+from morph_dslam.tracking.outcomes import ModelDoesNotExplain
 from morph_dslam.tracking.placement import (
     FramesAt,
     PlacedObject,
@@ -200,7 +201,11 @@ class _Job:
         sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
         self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
-        self._checks = {p.name: CameraCheck(p.camera) for p in placed if _checks_camera(p, run)}
+        self._checks = {
+            part.name: CameraCheck(part.camera, deforms=bool(part.model.parameters))
+            for part in placed
+            if _checks_camera(part, run)
+        }
         self._log = None if run.frame_log is None else FrameLog(run.frame_log, self._folders[0])
         self._streams = self._opened_streams(stack)
         sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
@@ -250,6 +255,8 @@ class _Job:
         if part.object.scene is not None:
             notices += [Remark(note) for note in part.object.scene.camera_notes]
         checked = self._checks[part.name].estimate() if part.name in self._checks else None
+        if part.model.parameters and _leaves_residuals(folder.results):
+            checked = None  # what the model leaves may be its own error as well as the camera's
         if checked is not None:
             facts["camera"] = {term: found.facts() for term, found in checked.terms.items()}
             notices += [Remark(note) for note in camera_notes(checked)]
@@ -324,6 +331,11 @@ class _Job:
 def _checks_camera(part: PlacedObject, run: TrackOptions) -> bool:
     """Whether the object's points check the camera: one camera and a recording, which no map has been made of."""
     return not run.live and not run.other_cameras and part.object.scene is None and part.options.pose != "still"
+
+
+def _leaves_residuals(results: RunResults) -> bool:
+    """Whether the model does not explain some of the frames."""
+    return any(result.warning(ModelDoesNotExplain) is not None for result in results.results)
 
 
 def _shown_of(part: PlacedObject, run: TrackOptions) -> Shown | None:
