@@ -176,7 +176,7 @@ class _Projection:
         triangle = np.zeros((count, count))
         for k, column in enumerate(self._columns):
             triangle[: k + 1, k] = column
-        return np.linalg.solve(triangle, self._right[:count])
+        return np.asarray(np.linalg.solve(triangle, self._right[:count]), dtype=np.float64)
 
 
 class _Chebyshev:
