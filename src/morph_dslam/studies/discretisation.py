@@ -123,8 +123,10 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
     end = begin + CLOCK * SHARE / (1.0 - SHARE) * max(seconds, solving)
     announce(f"solving {len(chosen)} held-out states again with finer elements")
     solved, left_out = {}, ""
-    # From small strains to large ones: each solve starts from what the one before changed.
-    for index in sorted(chosen, key=lambda index: float(np.linalg.norm(snapshots.held_out[index].fields["strain"]))):
+    if not finer.iterative:
+        # From small strains to large ones: where a path has to be followed, it starts from the state before.
+        chosen.sort(key=lambda index: float(np.linalg.norm(snapshots.held_out[index].fields["strain"])))
+    for index in chosen:
         try:
             solved[index] = finer.solve(kept[index]["dofs"], kept[index]["mu"], lambda: time.monotonic() < end)
         except OutOfTime:

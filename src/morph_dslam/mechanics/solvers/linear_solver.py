@@ -316,7 +316,7 @@ class Solved(Protocol):
 
     @property
     def current(self) -> bool:
-        """Whether this is still the solver's latest one; an older one must not be used."""
+        """Whether it may still be used: a `LinearSolver` keeps the factors of its latest matrix alone."""
         ...
 
     @property
@@ -337,16 +337,11 @@ class TangentSolver(ABC):
     free : (n,) dofs that are solved for.
     symmetric : whether the matrices are (then one triangle of them is enough).
     all_free : free dofs of the equations, where these have more than the matrices; None if they do not.
-
-    Attributes
-    ----------
-    latest : the matrix that can be solved with.
     """
 
     def __init__(self, free: NDArray[np.bool_], symmetric: bool, all_free: NDArray[np.bool_] | None = None) -> None:
         self.free, self.symmetric = np.asarray(free, dtype=bool), symmetric
         self.all_free = self.free if all_free is None else all_free
-        self.latest: Solved | None = None
         self._triangle: tuple[Integers, bool] | None = None
 
     @abstractmethod
@@ -399,6 +394,7 @@ class LinearSolver(TangentSolver):
         self._block: _FreeBlock | None = None
         self._pattern: tuple[Integers, Integers] | None = None
         self._substitute: SuperLU | None = None
+        self.latest: Factorisation | None = None
 
     def factorise(self, data: Array, indices: Integers, indptr: Integers) -> Factorisation:
         """See `TangentSolver`."""
@@ -409,8 +405,8 @@ class LinearSolver(TangentSolver):
         self._substitute = None
         if matrix.shape[0]:
             self.engine.factorise(matrix)
-        factorisation = self.latest = Factorisation(self, matrix, block.triangular)
-        return factorisation
+        self.latest = Factorisation(self, matrix, block.triangular)
+        return self.latest
 
     def _block_of(self, indices: Integers, indptr: Integers) -> _FreeBlock:
         """The free block's pattern, worked out again only when K's pattern has changed."""

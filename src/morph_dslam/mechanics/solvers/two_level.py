@@ -30,7 +30,9 @@ DEGREE, COVERED = 10, 40.0
 POWER_ITERATIONS, MARGIN = 15, 1.15
 #: Where GMRES ends, in units of the right-hand side, also where more equations build on its results (motions of
 #: couplings follow from small differences of large forces), and where it is given up.
-RELATIVE_RESIDUAL, BUILT_ON, MOST_ITERATIONS = 0.03, 1e-3, 60
+RELATIVE_RESIDUAL, BUILT_ON, MOST_ITERATIONS = 0.01, 1e-3, 60
+#: Parts in which the matrix of the added dofs is cut out.
+PORTIONS = 16
 
 
 @dataclass(frozen=True)
@@ -91,23 +93,20 @@ class TwoLevelSolver(TangentSolver):
         matrix = sp.csr_matrix((data, indices, indptr), shape=(len(self.free), len(self.free)))
         if self.symmetric and self.is_triangle(matrix):
             matrix = matrix + sp.tril(matrix, -1).T + sp.triu(matrix, 1).T
-        prepared = self.latest = _Prepared(self, sp.csr_matrix(matrix))
-        return prepared
+        return _Prepared(self, sp.csr_matrix(matrix))
 
 
 class _Prepared:
     """One matrix with its preconditioner."""
 
-    negative_pivots = None
+    current, negative_pivots = True, None
 
     def __init__(self, solver: TwoLevelSolver, matrix: Matrix) -> None:
         self._solver, self._matrix = solver, matrix
-        self._polynomial = _Chebyshev(matrix[solver.added][:, solver.added])
-
-    @property
-    def current(self) -> bool:
-        """Whether this is the solver's latest matrix."""
-        return self._solver.latest is self
+        # A few rows at a time: a copy of them all would be the largest array of the solver.
+        parts = np.array_split(solver.added, PORTIONS)
+        blocks = [matrix[rows][:, solver.added].astype(np.float32) for rows in parts]
+        self._polynomial = _Chebyshev(sp.csr_matrix(sp.vstack(blocks)))
 
     def _precondition(self, forces: Array) -> Array:
         """Dofs (n,) that balance ``forces`` (n,) roughly."""
@@ -177,15 +176,17 @@ class _Projection:
         triangle = np.zeros((count, count))
         for k, column in enumerate(self._columns):
             triangle[: k + 1, k] = column
-        return np.linalg.solve(triangle, self._right[:count])
+        return np.asarray(np.linalg.solve(triangle, self._right[:count]), dtype=np.float64)
 
 
 class _Chebyshev:
-    """A polynomial of D^-1 A, D the diagonal of A, in place of A^-1 (Saad, Iterative Methods for Sparse Linear Systems,
-    2003, section 12.3)."""
+    """A polynomial of D^-1 A in place of A^-1, in single precision as A is; D is the diagonal of A.
+
+    Saad, Iterative Methods for Sparse Linear Systems, 2003, section 12.3.
+    """
 
     def __init__(self, matrix: Matrix) -> None:
-        self._matrix = matrix.astype(np.float32)
+        self._matrix = matrix
         self._inverse = 1.0 / self._matrix.diagonal()
         vector, largest = np.random.default_rng(0).standard_normal(matrix.shape[0]).astype(np.float32), 0.0
         for _ in range(POWER_ITERATIONS):
