@@ -174,28 +174,15 @@ def jumps(count):
         yield State(shape.parameters, moved)
 
 
-def jumped(model, film, truth, interval):
-    """Results of the frame after the jump and of one more like it, where frames came every 30th of a second."""
-    tracker = start(model, film)
-    for i in range(3):
-        tracker.track(Frame(i, i / 30, film.frame(sheet_state(0.02 * i))))
-    times = 2 / 30 + interval, 3 / 30 + interval
-    return [tracker.track(Frame(3 + i, time, film.frame(truth))) for i, time in enumerate(times)]
-
-
 def test_object_that_moved_in_a_gap_of_the_recording_is_looked_for_anew(model, film):
     for truth in jumps(5):
-        first, second = jumped(model, film, truth, 3.0)
+        tracker = start(model, film)
+        for i in range(3):
+            tracker.track(Frame(i, i / 30, film.frame(sheet_state(0.02 * i))))
+        first, second = (tracker.track(Frame(3 + i, 3.0 + i / 30, film.frame(truth))) for i in range(2))
         assert first.recovered
         assert mean_error(model, first.estimate.state, truth) < 2e-3
         assert mean_error(model, second.estimate.state, truth) < 0.1e-3
-
-
-def test_object_that_was_found_anew_has_no_velocity_yet(model, film):
-    truth = list(jumps(8))[7]
-    first, second = jumped(model, film, truth, 1 / 30)
-    assert first.recovered
-    assert mean_error(model, second.estimate.state, truth) < 0.1e-3
 
 
 def test_second_identical_object_is_not_taken_for_the_first(model, film):

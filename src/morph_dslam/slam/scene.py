@@ -28,6 +28,7 @@ from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
 from morph_dslam.slam.self_calibration import (
+    CHECKED,
     TERMS,
     CameraEstimate,
     CameraTerm,
@@ -96,7 +97,7 @@ class Scene:
         """Whether lengths are metres."""
         return self.map.is_metric
 
-    def camera_estimate(self, terms: Sequence[CameraTerm] = TERMS) -> CameraEstimate | None:
+    def camera_estimate(self, terms: Sequence[CameraTerm] = CHECKED) -> CameraEstimate | None:
         """The camera as the recording shows it.
 
         Where too few frames or points tell of it, all terms are unobservable. None without a path, of a map that was

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 #: What can be estimated of a camera.
 CameraTerm = Literal["focal", "centre", "radial", "tangential", "readout"]
 TERMS: tuple[CameraTerm, ...] = get_args(CameraTerm)
+#: What a check estimates: tangential terms that matter are rare, and hide a principal point that is wrong.
+CHECKED: tuple[CameraTerm, ...] = ("focal", "centre", "radial", "readout")
 #: Unknowns of each term: logarithm of the focal length, principal point in pixels, k1 and k2, p1 and p2, seconds.
 COLUMNS: dict[CameraTerm, list[int]] = {
     "focal": [0], "centre": [1, 2], "radial": [3, 4], "tangential": [5, 6], "readout": [7],
@@ -415,7 +417,11 @@ class _Recording:
 
 @one_thread_for_algebra
 def estimate_camera(
-    rigid_map: RigidMap, camera: Camera, path: Trajectory, seen: Sequence[Followed], terms: Sequence[CameraTerm] = TERMS
+    rigid_map: RigidMap,
+    camera: Camera,
+    path: Trajectory,
+    seen: Sequence[Followed],
+    terms: Sequence[CameraTerm] = CHECKED,
 ) -> CameraEstimate:
     """Terms of a camera from the frames of a recording; as known before where there are too few frames or points.
 

@@ -185,7 +185,7 @@ class Tracker:
                 hypothesis, found_by, rejection = self._relocalize(image, hypothesis, rejection, camera)
             if rejection is None:
                 hypothesis = self._refine(image, hypothesis, camera)
-            self._update(image, hypothesis, found_by, rejection, camera)
+            self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
             change = self._choose_view(image, hypothesis, result)
         times = clock.milliseconds | {"locate": camera.milliseconds}
@@ -332,16 +332,11 @@ class Tracker:
         return hypothesis
 
     def _update(
-        self,
-        image: Image,
-        hypothesis: PoseHypothesis,
-        found_by: FoundBy,
-        rejection: Rejection | None,
-        camera: CameraLocalization,
+        self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection | None, camera: CameraLocalization
     ) -> None:
         """Keep what the next frame starts from; a lost frame keeps the last known shape."""
         if rejection is None:
-            self._learn(image, hypothesis, found_by is FoundBy.FLOW)
+            self._learn(image, hypothesis)
         else:
             self.last_measured = self.reference.nothing_measured
             if self.estimator.loads is not None:
@@ -495,8 +490,8 @@ class Tracker:
             return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
         return np.nan_to_num(last - self.reference.projected(self._velocity_base))
 
-    def _learn(self, image: Image, hypothesis: PoseHypothesis, is_followed: bool) -> None:
-        """Take in an accepted frame; one in which the object was found anew says nothing of its velocity."""
+    def _learn(self, image: Image, hypothesis: PoseHypothesis) -> None:
+        """Take in an accepted frame."""
         estimate, inliers, pixels = hypothesis.estimate, hypothesis.inliers, hypothesis.measurement.pixels
         self.last_seen = None
         if not self._view.number:
@@ -508,7 +503,7 @@ class Tracker:
                 self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
         if self.estimator.loads is not None:
             self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
-        self._velocity_base = self._last if is_followed else estimate.state
+        self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
         self._start = with_unobservable_at_default(self.model, estimate)
         if self.options.start == "constant-velocity":
@@ -517,7 +512,7 @@ class Tracker:
         self._pixels = np.where(inliers[:, None], pixels, self.reference.projected(self._last))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis, image)
-        if is_followed:
+        if not self._lost:
             self._view.recovery.learn(hypothesis)
 
     def _choose_view(self, image: Image, hypothesis: PoseHypothesis, result: FrameResult) -> Change | None:
