@@ -178,8 +178,13 @@ class Recovery:
         """
         points, average = self._node_rule()
         result = {"displacement": self._problem.nodal_displacement(dofs)}
+        self._set(dofs, mu)
+        F, P = self._gradient_and_stress(points)
         for name in names:
-            result[name] = average @ self._evaluate(name, dofs, mu, points)
+            values, history = _derived(name, F, P), self._problem.history
+            if history and name in STRESSES:
+                values = values + _overstress(name, F, history.remembered_at(points))
+            result[name] = average @ _components(name, values)
         if "stress" in names:
             result["von_mises"] = von_mises(result["stress"])
         return result
@@ -215,16 +220,10 @@ class Recovery:
         self._solution.set(dofs)
         return self._solution.F
 
-    def _evaluate(self, name: str, dofs: Array, mu: Array, points: NDArray) -> Array:
-        self._set(dofs, mu)
-        F, P = self._gradient(points), self._by_region([law.stress for law in self._laws], points)
-        values, history = _derived(name, F, P), self._problem.history
-        if history and name in STRESSES:
-            values += _overstress(name, F, history.remembered_at(points))
-        return _components(name, values)
-
-    def _gradient(self, points: NDArray) -> Array:
-        return self._by_region([self._solution.F] * len(self._laws), points)
+    def _gradient_and_stress(self, points: NDArray) -> tuple[Array, Array]:
+        """F and P (p, 3, 3) of the solution that is set."""
+        F = self._by_region([self._solution.F] * len(self._laws), points)
+        return F, self._by_region([law.stress for law in self._laws], points)
 
     def _slopes(
         self,
@@ -236,7 +235,7 @@ class Recovery:
     ) -> dict[str, list[Array]]:
         """Derivatives of fields along changes of the solution, each with the parameter that causes it or None."""
         self._set(dofs, mu)
-        F, P = self._gradient(points), self._by_region([law.stress for law in self._laws], points)
+        F, P = self._gradient_and_stress(points)
         tangent = self._by_region([law.tangent for law in self._laws], points, (9, 9))
         result: dict[str, list[Array]] = {name: [] for name in names}
         for index, slope in directions:

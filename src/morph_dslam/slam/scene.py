@@ -20,6 +20,7 @@ from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
+from morph_dslam.slam.camera_notes import camera_notes
 from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
@@ -33,7 +34,6 @@ from morph_dslam.slam.self_calibration import (
     CameraEstimate,
     CameraTerm,
     TermEstimate,
-    camera_notes,
     estimate_camera,
     terms_of,
     with_terms_of,

@@ -8,7 +8,7 @@ to Cluster-Robust Inference, 2015), not of independent pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -527,43 +527,3 @@ def _effects(camera: Camera, views: _Views) -> dict[CameraTerm, Array]:
         "tangential": tangential,
         "readout": by_readout.reshape(-1, 1) / np.sqrt(len(by_readout)),
     }
-
-
-def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
-    """What a reader of a run must know of its camera, whose terms were all estimated."""
-    wrong: list[CameraTerm] = [term for term, found in estimate.terms.items() if found.is_wrong and found.is_observable]
-    named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in wrong if term != "readout"]
-    if named:
-        yield (
-            f"the camera file does not fit this recording: {'; '.join(named)}. Calibrate the camera again, or estimate "
-            "it with morph slam --refine-camera"
-        )
-    if "readout" in wrong:
-        yield (
-            f"the camera has a rolling shutter: readout_s {_described('readout', estimate.terms['readout'])}. Write it "
-            "into the camera file, or estimate it with morph slam --refine-camera readout"
-        )
-    hidden: list[CameraTerm] = [
-        term for term, found in estimate.terms.items() if not found.is_observable and term != "readout"
-    ]
-    if hidden:
-        named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in hidden]
-        yield f"this recording cannot check the camera file: unobservable here: {'; '.join(named)}"
-
-
-_NAMES: dict[CameraTerm, str] = {
-    "focal": "focal length",
-    "centre": "principal point",
-    "radial": "lens distortion k1, k2",
-    "tangential": "lens distortion p1, p2",
-    "readout": "readout_s",
-}
-
-
-def _described(term: CameraTerm, found: TermEstimate) -> str:
-    """Given and estimated values, with two standard deviations."""
-    unit, digits = (" px", 1) if term in ("focal", "centre") else (" s" if term == "readout" else "", 4)
-    intervals = zip(found.estimated, found.std, strict=True)
-    given = ", ".join(f"{value:.{digits}f}" for value in found.given)
-    shown = ", ".join(f"{value:.{digits}f} ± {2.0 * std:.{digits}f}" for value, std in intervals)
-    return f"{given}{unit}, by the recording {shown}{unit} (95 %)"

@@ -115,7 +115,7 @@ export async function scanStart(app) {
       el('button', { id: `take-rival-${i}`, onclick: () => app.doing(() => call('find_place', { frame: number, rival: i })) }, 'Find it there')));
     const rivals = others.length ? [el('p', { className: 'note' }, 'Other places, with their score over that of the first:'),
       el('ul', { className: 'list', id: 'rivals' }, ...others)] : [];
-    // What is told, and what is accepted, is the first place: it must be the one that is seen.
+    // The evidence is of the first place, and so is what is accepted: it must be the one that is seen.
     if (shown !== null) {
       return [el('h3', {}, `Place ${shown + 2}`), el('p', { className: 'note' }, 'Find the object there to see what speaks for it.'), ...rivals,
         el('button', { id: 'first-place', onclick: () => look(null) }, 'Show the first place')];
