@@ -12,12 +12,12 @@ the mesh. Memory grows with the matrix K alone, and the number of iterations har
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solvers.linear_solver import Integers, Matrix, TangentSolver
@@ -29,8 +29,8 @@ DEGREE, COVERED = 10, 40.0
 #: Power iterations to the largest eigenvalue, and the factor that makes an upper bound of their result.
 POWER_ITERATIONS, MARGIN = 15, 1.15
 #: Where GMRES ends, in units of the right-hand side, also where more equations build on its results (motions of
-#: couplings follow from small differences of large forces), and where it is given up.
-RELATIVE_RESIDUAL, BUILT_ON, MOST_ITERATIONS = 0.01, 1e-3, 60
+#: couplings follow from small differences of large forces), where it starts anew, and where it is given up.
+RELATIVE_RESIDUAL, BUILT_ON, RESTART, MOST_ITERATIONS = 0.01, 1e-3, 30, 60
 #: Parts in which the matrix of the added dofs is cut out.
 PORTIONS = 16
 
@@ -127,56 +127,21 @@ class _Prepared:
         return np.array([self._gmres(row) for row in np.atleast_2d(right)]).reshape(right.shape)
 
     def _gmres(self, right: Array) -> Array:
-        """The solution by GMRES, preconditioned from the right (Saad and Schultz, 1986)."""
-        right = np.where(self._solver.free, right, 0.0)
-        size = float(np.linalg.norm(right))
-        if not np.isfinite(size):
+        """The solution by GMRES (Saad and Schultz, 1986), preconditioned from the right: its residual is that of K."""
+        free, shape = self._solver.free, self._matrix.shape
+        right = np.where(free, right, 0.0)
+        if not np.all(np.isfinite(right)):
             raise SolverError("the right-hand side of a linear solve is not finite")
-        if size == 0.0:
-            return right
-        basis, directions, projection = [right / size], [], _Projection(size)
-        while len(directions) < MOST_ITERATIONS:
-            directions.append(self._precondition(basis[-1]))
-            image = np.where(self._solver.free, self._matrix @ directions[-1], 0.0)
-            products = []
-            for vector in basis:
-                products.append(float(vector @ image))
-                image -= products[-1] * vector
-            norm = float(np.linalg.norm(image))
-            if projection.add([*products, norm]) <= self._solver.tolerance * size:
-                return np.sum([w * d for w, d in zip(projection.weights(), directions, strict=True)], axis=0)
-            basis.append(image / norm)
-        raise SolverError(f"the iterative solver has not converged in {MOST_ITERATIONS} iterations")
 
+        def image(forces: Array) -> Array:
+            return np.where(free, self._matrix @ self._precondition(forces), 0.0)
 
-class _Projection:
-    """The small least-squares problem of GMRES, kept triangular by rotations of neighbouring rows."""
-
-    def __init__(self, size: float) -> None:
-        self._columns: list[list[float]] = []
-        self._rotations: list[tuple[float, float]] = []
-        self._right = [size]
-
-    def add(self, column: list[float]) -> float:
-        """Take one more ``column`` of the Hessenberg matrix; the size of the residual then."""
-        for i, (cosine, sine) in enumerate(self._rotations):
-            upper, lower = column[i], column[i + 1]
-            column[i], column[i + 1] = cosine * upper + sine * lower, cosine * lower - sine * upper
-        length = math.hypot(column[-2], column[-1])
-        cosine, sine = column[-2] / length, column[-1] / length
-        self._rotations.append((cosine, sine))
-        self._columns.append([*column[:-2], length])
-        last = self._right[-1]
-        self._right[-1:] = [cosine * last, -sine * last]
-        return abs(self._right[-1])
-
-    def weights(self) -> Array:
-        """What each direction counts in the solution."""
-        count = len(self._columns)
-        triangle = np.zeros((count, count))
-        for k, column in enumerate(self._columns):
-            triangle[: k + 1, k] = column
-        return np.asarray(np.linalg.solve(triangle, self._right[:count]), dtype=np.float64)
+        operator = LinearOperator(shape, matvec=image, dtype=np.float64)  # type: ignore[call-arg]
+        restarts = MOST_ITERATIONS // RESTART
+        found, missed = gmres(operator, right, rtol=self._solver.tolerance, restart=RESTART, maxiter=restarts)
+        if missed:
+            raise SolverError(f"the iterative solver has not converged in {MOST_ITERATIONS} iterations")
+        return self._precondition(found)
 
 
 class _Chebyshev:
