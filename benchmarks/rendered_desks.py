@@ -1,12 +1,13 @@
 """Registration of rigid objects on rendered desks, where a larger textured board and clutter stand around them.
 
-    python benchmarks/rendered_desks.py [--seeds N] [--first K] [--hints none distance clicks] [--again maps]
+    python benchmarks/rendered_desks.py [--seeds N] [--first K] [--hints none distance clicks guess] [--again maps]
                                         [--cache FOLDER] [--make-only] [--pictures]
 
 A desk (desk_scenes.py) has one of 13 shapes, with few marks on it, and is filmed in 81 frames of 640x480 pixels by a
 trembling hand with a rolling shutter; SLAM maps it with one camera, so without a scale. The object is then registered
-as `morph register` does: without a hint, with a rough distance (10 to 30 % off), or with four points clicked in one
-frame (1 px off each way). Desks and maps are kept in the cache; ``--again maps`` makes new maps of the recordings.
+as `morph register` does: without a hint, with a rough distance (10 to 30 % off), with four points clicked in one
+frame (1 px off each way), or with a guess in one frame (24 px aside, 8 % too near or too far, turned by 8 degrees).
+Desks and maps are kept in the cache; ``--again maps`` makes new maps of the recordings.
 
 A registration counts as right where it is unambiguous and, in the first keyframe in which the object is registered,
 the middle of its box is within 5 mm (6 % of the object's diagonal if that is larger) and its attitude within 3 degrees
@@ -28,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import morph_dslam as md
 from desk_scenes import Shape, shape_of, shapes, with_sharp_edges, write_desk
@@ -41,11 +43,13 @@ from support import keep
 
 Array = NDArray[np.float64]
 CACHE = Path(__file__).resolve().parent / "output" / "rendered_desks"
-HINTS = ("none", "distance", "clicks")
+HINTS = ("none", "distance", "clicks", "guess")
 #: What counts as right: place, mm, or share of the object's diagonal if that is larger; angle, degrees.
 PLACE_LIMIT, PLACE_SHARE, ANGLE_LIMIT = 5.0, 0.06, 3.0
 #: How far a distance given as a hint is off, as a share, and a clicked point, pixels.
 DISTANCE_OFF, CLICK_OFF, N_CLICKS = (0.1, 0.3), 1.0, 4
+#: How far a guess is off: aside, pixels; the distance, as a share; the attitude, degrees.
+GUESS_ASIDE, GUESS_DISTANCE, GUESS_TURN = 24.0, 0.08, 8.0
 
 
 @dataclass(frozen=True)
@@ -162,8 +166,8 @@ def load_desk(seed: int, folder: Path) -> Desk:
     return Desk(seed, shape, model, scene, poses, truth["pixels"], truth["visible"], surface, place)
 
 
-def hints_of(desk: Desk, hint: str) -> dict[str, object]:
-    """What a user would give, as arguments of `md.register`."""
+def hints_of(desk: Desk, hint: str, folder: Path) -> dict[str, object]:
+    """What a user would give, as arguments of `md.register`; files are written to the folder."""
     rng = np.random.default_rng([17, desk.seed])
     if hint == "distance":
         off = rng.uniform(*DISTANCE_OFF) * rng.choice([-1.0, 1.0])
@@ -178,7 +182,23 @@ def hints_of(desk: Desk, hint: str) -> dict[str, object]:
             chosen.append(int(np.argmax(np.linalg.norm(pixels[:, None] - pixels[chosen], axis=2).min(axis=1))))
         clicked = pixels[chosen] + rng.normal(0.0, CLICK_OFF, (len(chosen), 2))
         return {"landmarks": Landmarks(desk.surface[seen[chosen]], clicked, np.full(len(chosen), keyframe))}
+    if hint == "guess":
+        return {"guess": write_guess(desk, folder / "guess.toml", rng)}
     return {}
+
+
+def write_guess(desk: Desk, path: Path, rng: np.random.Generator) -> Path:
+    """The file of a guess in the keyframe in the middle."""
+    keyframe = desk.scene.map.keyframes[len(desk.scene.map.keyframes) // 2].index
+    true = desk.camera_from_object[keyframe]
+    aside, turn = rng.normal(size=2), rng.normal(size=3)
+    aside *= GUESS_ASIDE * true[2, 3] / desk.scene.camera.fx / np.linalg.norm(aside)
+    turned = Rotation.from_rotvec(np.radians(GUESS_TURN) * turn / np.linalg.norm(turn)).as_matrix() @ true[:3, :3]
+    place = (1.0 + GUESS_DISTANCE * rng.choice([-1.0, 1.0])) * (true[:3, 3] + np.append(aside, 0.0))
+    angles = Rotation.from_matrix(turned).as_euler("xyz", degrees=True)
+    pose = f"[pose]\nposition_mm = {(1e3 * place).tolist()}\nrotation_deg = {angles.tolist()}\n"
+    path.write_text(f"frame = {keyframe}\n{pose}")
+    return path
 
 
 def angle_between(a: Array, b: Array, shape: Shape) -> float:
@@ -189,11 +209,11 @@ def angle_between(a: Array, b: Array, shape: Shape) -> float:
     return float(np.degrees(min(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)) for turn in turns)))
 
 
-def attempt(desk: Desk, hint: str, picture: Path | None) -> Attempt:
+def attempt(desk: Desk, hint: str, folder: Path, picture: Path | None) -> Attempt:
     """Register the object once and compare it with the truth in its first keyframe."""
     began = time.perf_counter()
     try:
-        found = md.register(desk.scene, desk.model, **hints_of(desk, hint))  # type: ignore[arg-type]
+        found = md.register(desk.scene, desk.model, **hints_of(desk, hint, folder))  # type: ignore[arg-type]
     except md.MorphError as error:
         print(f"seed={desk.seed} {hint}: {error}")
         return Attempt(hint, time.perf_counter() - began)
@@ -249,7 +269,7 @@ def main() -> int:
             print(start, flush=True)
             continue
         pictures = [folder / f"{hint}.jpg" if arguments.pictures else None for hint in arguments.hints]
-        attempts.append([attempt(desk, *each) for each in zip(arguments.hints, pictures, strict=True)])
+        attempts.append([attempt(desk, hint, folder, at) for hint, at in zip(arguments.hints, pictures, strict=True)])
         print(start, *(each.text() for each in attempts[-1]), flush=True)
     if attempts:
         print(last_line(attempts, points, arguments.seeds))

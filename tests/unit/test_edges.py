@@ -1,4 +1,4 @@
-"""An object laid by its edges: from near, by three landmarks, by a rough distance; and none where nothing is seen."""
+"""An object laid by its edges: from near, by landmarks, a guess or a rough distance; and none where nothing is seen."""
 
 from dataclasses import replace
 
@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.edges import EdgeImages, MeshEdges, Sighting
 from morph_dslam.registration.scene import View, camera_from_object
-from morph_dslam.registration.view_registration import EdgeSearch, Hints
+from morph_dslam.registration.view_registration import EdgeSearch, GuessedPose, Hints
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.patches import normalize_contrast
 from tests.support.rendered_object import CAMERA, scanned, wedge
@@ -109,6 +109,32 @@ def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
     best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, False, Hints(clicks=(clicks,))).search()[0]
     assert apart(best.place, WORLD) < 1.5e-3
     assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
+def test_a_guess_within_30_pixels_places_an_object_and_gives_the_unit(scan, seed):
+    points, views = scan
+    true, rng = camera_from_object(views[2], WORLD), np.random.default_rng(seed)
+    aside = rng.normal(size=2)
+    aside *= 24.0 * true.translation[2] / CAMERA.fx / np.linalg.norm(aside)
+    turn = rng.normal(size=3)
+    turned = Rotation.from_rotvec(np.radians(8.0) * turn / np.linalg.norm(turn)).as_matrix() @ true.rotation
+    off = RigidTransform(turned, rng.choice([0.92, 1.08]) * (true.translation + np.append(aside, 0.0)))
+    moved = np.linalg.norm(CAMERA.project(off.apply(NODES)) - CAMERA.project(true.apply(NODES)), axis=1)
+    assert 20.0 < moved.max() < 50.0
+    guess = GuessedPose(views[2].frame, views[2].camera_from_world, off)
+    best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, False, Hints(guess=guess)).search()[0]
+    assert apart(best.place, WORLD) < 1.5e-3
+    assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
+
+
+def test_a_guess_out_of_the_image_is_refused(scan):
+    points, views = scan
+    behind = RigidTransform(np.eye(3), np.array([0.0, 0.0, -0.5]))
+    guess = GuessedPose(views[2].frame, views[2].camera_from_world, behind)
+    with pytest.raises(RegistrationError) as caught:
+        EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, False, Hints(guess=guess)).search()
+    assert caught.value.reason is RegistrationFailure.GUESS_CONTRADICTED
 
 
 @pytest.mark.slow

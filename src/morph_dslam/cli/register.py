@@ -27,6 +27,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--region", type=region, metavar="N:LEFT,TOP,RIGHT,BOTTOM", help="box around the object in keyframe N, pixels"
     )
+    add_file(command, "--guess", "about where the object is in a frame of the scan", "TOML")
     add_repeated(
         command,
         "--beside",
@@ -50,6 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
         landmarks=arguments.landmarks,
         distance=arguments.distance,
         region=arguments.region,
+        guess=arguments.guess,
     )
     assert registration.scene is not None
     for note in [*(warning.text for warning in registration.warnings), *registration.scene.camera_notes]:

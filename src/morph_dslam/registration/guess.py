@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -54,10 +55,14 @@ class Pose(Section):
 
 
 class GuessFile(Section):
-    """A guess: the pose, and values of any of the model's parameters in the units in which it shows them."""
+    """A guess: the pose, and values of any of the model's parameters in the units in which it shows them.
+
+    In a map also the number of the frame.
+    """
 
     pose: Pose
     parameters: dict[str, FiniteFloat] = Field(default_factory=dict)
+    frame: Annotated[int, Field(ge=0)] | None = None
 
 
 @dataclass(frozen=True)
@@ -78,8 +83,13 @@ class GuessInitializer:
             k = names.index(name)
             shown = model.parameters[k].display(1.0)  # of one SI unit
             values[k] = np.clip(value / shown, model.lower[k], model.upper[k])
+        return State(values, self.pose)
+
+    @property
+    def pose(self) -> RigidTransform:
+        """The guessed camera_from_object, metres."""
         turn = Rotation.from_euler("xyz", self.guess.pose.rotation_deg, degrees=True).as_matrix()
-        return State(values, RigidTransform(turn, 1e-3 * np.array(self.guess.pose.position_mm)))
+        return RigidTransform(turn, 1e-3 * np.array(self.guess.pose.position_mm))
 
     def register(self, model: ReducedModel, camera: Camera, grey: Image) -> Registration:
         """The object in an undistorted image (h, w).

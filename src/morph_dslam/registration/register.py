@@ -19,6 +19,7 @@ from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
+from morph_dslam.registration.guess import load_guess
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit
 from morph_dslam.registration.registration import (
     KeyframePose,
@@ -29,7 +30,7 @@ from morph_dslam.registration.registration import (
     registration_in_map,
 )
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, spread_views
-from morph_dslam.registration.view_registration import Hints
+from morph_dslam.registration.view_registration import GuessedPose, Hints
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.slam.scene import Scene, load_scene
@@ -48,6 +49,7 @@ def register(
     landmarks: Landmarks | str | Path | None = None,
     distance: float | None = None,
     region: tuple[int, tuple[float, float, float, float]] | None = None,
+    guess: str | Path | None = None,
 ) -> Registration:
     """Find a model's undeformed object in a mapped scene by its edges, its shape and its texture.
 
@@ -63,14 +65,22 @@ def register(
         the file that has them. They have frame numbers.
     distance : rough distance of the object from the camera, metres; it may be off by half.
     region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
+    guess : file that says about where the object is in a frame of the map's recording; not beside other hints.
 
     Raises
     ------
     RegistrationError
         If the object is not found, or a hint names a frame without a pose.
     """
-    clicks = () if landmarks is None else _sightings(landmarks, scene)
-    hints, claimed = Hints(clicks, distance, region), partial(without_points_on, beside)
+    if guess is not None and not (landmarks is None and distance is None and region is None):
+        raise RegistrationError("a guess says where the object is: leave out landmarks, distance and region")
+    hints = Hints(
+        () if landmarks is None else _sightings(landmarks, scene),
+        distance,
+        region,
+        None if guess is None else _guessed(Path(guess), scene),
+    )
+    claimed = partial(without_points_on, beside)
     points, views = claimed(*points_and_views(scene))
     nodes = model.positions(model.default)
     found = register_in_unit(
@@ -101,21 +111,36 @@ def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sightin
     given = landmarks if isinstance(landmarks, Landmarks) else load_landmarks(Path(landmarks))
     if given.frames is None:
         raise RegistrationError("landmarks in a map need the numbers of their frames: a first column 'frame'")
-    path = scene.trajectory
-    poses = {int(k): np.linalg.inv(m) for k, m in zip(path.indices, path.world_from_camera, strict=True)}
-    poses |= {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
     pixels = np.ascontiguousarray(scene.camera.undistort_pixels(given.pixels))
     sightings = []
     for frame in np.unique(given.frames).tolist():
-        if frame not in poses:
-            raise RegistrationError(
-                f"frame {frame} has no pose in the map, which has frames {min(poses)}-{max(poses)}: set the landmarks "
-                "in one of these"
-            )
         rows = given.frames == frame
-        pose = RigidTransform.from_matrix(poses[frame])
+        pose = _camera_in(scene, frame, "landmarks")
         sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(pixels[rows])))
     return tuple(sightings)
+
+
+def _guessed(path: Path, scene: Scene) -> GuessedPose:
+    """A guess, with the camera's pose in its frame."""
+    given = load_guess(path)
+    if given.guess.frame is None:
+        raise RegistrationError(f"{path}: a guess in a map needs the number of its frame, 'frame = N' above [pose]")
+    if given.guess.parameters:
+        raise RegistrationError(f"{path}: the object is undeformed in a map: leave out [parameters]")
+    return GuessedPose(given.guess.frame, _camera_in(scene, given.guess.frame, "guess"), given.pose)
+
+
+def _camera_in(scene: Scene, frame: int, hint: str) -> RigidTransform:
+    """The camera's pose in a frame that a hint names; raises RegistrationError if the map has none."""
+    path = scene.trajectory
+    poses = {int(k): np.linalg.inv(m) for k, m in zip(path.indices, path.world_from_camera, strict=True)}
+    poses |= {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
+    if frame not in poses:
+        raise RegistrationError(
+            f"frame {frame} has no pose in the map, which has frames {min(poses)}-{max(poses)}: set the {hint} "
+            "in one of these"
+        )
+    return RigidTransform.from_matrix(poses[frame])
 
 
 def without_points_on(
@@ -162,6 +187,7 @@ def run_registration(
     landmarks: Path | None = None,
     distance: float | None = None,
     region: tuple[int, tuple[float, float, float, float]] | None = None,
+    guess: Path | None = None,
 ) -> Registration:
     """Register an object from files to files: ``registration.json``, and ``registration.jpg`` without a board.
 
@@ -173,7 +199,7 @@ def run_registration(
     output : the folder to write.
     beside : files of registrations of other objects in this map, to which the points on them are left.
     board : file of a board that stands in the scene, to register by; by the mesh if None.
-    landmarks, distance, region : hints, as of `register`.
+    landmarks, distance, region, guess : hints, as of `register`.
 
     Raises
     ------
@@ -183,7 +209,8 @@ def run_registration(
     MapError, ModelFileError, CameraError
         If an input cannot be read.
     """
-    if board is not None and (beside or landmarks is not None or distance is not None or region is not None):
+    hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region, "guess": guess}
+    if board is not None and (beside or any(hint is not None for hint in hints.values())):
         raise RegistrationError("a board says where the object is: leave out --beside and the hints")
     camera, model = load_camera(camera_path), load_model(model_path)
     others = [_load_beside(path, map_path) for path in beside]
@@ -191,7 +218,6 @@ def run_registration(
     if board is not None:
         registration = register_board(scene, model, board)
     else:
-        hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region}
         registration = register(scene, model, others, progress=True, **hints)
     registration.save(output / "registration.json", map_path, model_path)
     if board is None:

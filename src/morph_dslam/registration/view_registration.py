@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
-from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.registration.dense_points import DEPTH_NOISE, PointsOnSurface, with_dense_points
 from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, MeshEdges, Sighting
 from morph_dslam.registration.icp import Surface, same_place
@@ -60,6 +60,27 @@ TOLERANCE = 0.015
 MANY_CLICKS, N_MEANT = 6, 12
 #: Factor by which a rough distance may be off.
 ROUGH_FACTOR = 1.5
+#: A guess is one of so many places to begin from. The others are as far from it as guesses are from what is meant:
+#: standard deviations in pixels, of the distance (log), and of the attitude, radians.
+N_NEAR, NEAR_GUESS_PX, NEAR_GUESS_SIZE, NEAR_GUESS_TURN = 120, 12.0, 0.08, 0.12
+#: Pixels searched in turn for the edges about these.
+ABOUT_GUESS = (16, 8, 5, 3)
+
+
+@dataclass(frozen=True)
+class GuessedPose:
+    """About where an object is in a frame.
+
+    Attributes
+    ----------
+    frame : its number.
+    camera_from_world : the camera's pose in the map.
+    pose : camera_from_object, metres.
+    """
+
+    frame: int
+    camera_from_world: RigidTransform
+    pose: RigidTransform
 
 
 @dataclass(frozen=True)
@@ -71,11 +92,13 @@ class Hints:
     clicks : landmarks in frames whose camera is known.
     distance : rough distance of the object from the camera in the keyframes, metres.
     region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
+    guess : about where it is in a frame whose camera is known.
     """
 
     clicks: tuple[Sighting, ...] = ()
     distance: float | None = None
     region: tuple[int, tuple[float, float, float, float]] | None = None
+    guess: GuessedPose | None = None
 
 
 NO_HINTS = Hints()
@@ -148,6 +171,8 @@ class EdgeSearch:
         """
         if self._hints.clicks:
             return self._polished(self._fitted_from(self._by_clicks()))
+        if self._hints.guess is not None:
+            return self._polished(self._fitted_from(self._by_guess(self._hints.guess)))
         found: list[EdgeRegistration] = []
         for view in self._searched():
             found = self._distinct(found + self._fitted_from(self._in_keyframe(view)))
@@ -310,10 +335,16 @@ class EdgeSearch:
             return []
         found = hypotheses(self._drawings, self.edges, view, camera, sizes, places)
         starts = [] if found is None else self._agreeing(found, view)
-        one = EdgeImages([view], camera)
+        return self._best_in(view, starts, QUICK)
+
+    def _best_in(
+        self, view: View, starts: Sequence[SimilarityTransform], reaches: Sequence[float]
+    ) -> list[SimilarityTransform]:
+        """The places near ``starts`` for which most speaks in one keyframe, the best first."""
+        one = EdgeImages([view], self.camera)
 
         def ranked(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
-            place = one.refine(self.edges, start, True, QUICK, (), self._on_it)[0]
+            place = one.refine(self.edges, start, True, reaches, (), self._on_it)[0]
             return _rank(one.evidence(self.edges, place), self._points_in(place, [view])), place
 
         return [place for _, place in sorted(on_all_cores(ranked, starts), key=lambda pair: -pair[0])[:N_FITTED]]
@@ -337,24 +368,14 @@ class EdgeSearch:
         for click in self._hints.clicks:
             if len(click.points) < 3:
                 continue
-            view = min(self._dense[1], key=lambda view: abs(view.frame - click.frame))
             # Of few points, a pixel may turn the pose far: start from what the clicks may have meant, too.
             rng = np.random.default_rng(0)
             meant = [click] + [
                 replace(click, pixels=click.pixels + CLICK_PX * rng.normal(size=click.pixels.shape))
                 for _ in range(N_MEANT if len(click.points) < MANY_CLICKS else 0)
             ]
-            for pose in (pose for each in meant for pose in solve_pnp(each.points, each.pixels, self.camera)):
-                # The points are known where a keyframe sees them; the object stands still.
-                near = RigidTransform.from_matrix(
-                    view.camera_from_world.matrix @ np.linalg.inv(click.camera_from_world.matrix)
-                )
-                unit = 1.0
-                for _ in range(3):
-                    between = RigidTransform(near.rotation, near.translation / unit)
-                    found = map_unit(between @ pose, self.edges, view, self._dense[0], self.camera)[0]
-                    unit = found if found > 0.0 else unit
-                starts.append(placed(pose, click, unit, self._metric))
+            poses = (pose for each in meant for pose in solve_pnp(each.points, each.pixels, self.camera))
+            starts += [self._in_map(pose, click) for pose in poses]
         if not starts:
             raise RegistrationError(
                 "no pose of the object explains the landmarks: give three or more in one frame, and check that points "
@@ -362,6 +383,42 @@ class EdgeSearch:
                 RegistrationFailure.LANDMARKS_DO_NOT_FIT,
             )
         return starts
+
+    def _by_guess(self, guess: GuessedPose) -> list[SimilarityTransform]:
+        """Where the keyframe next to a guess has the object near it, the best first."""
+        rng, pose = np.random.default_rng(0), guess.pose
+        centre = pose.apply(self.edges.nodes.mean(axis=0))
+        column, row = self.camera.project(centre[None])[0] if centre[2] > 0.0 else (-1.0, -1.0)
+        if not (0.0 <= column < self.camera.width and 0.0 <= row < self.camera.height):
+            raise RegistrationError(
+                "the guess puts the object out of the image: its frame is the camera's, x right, y down, z ahead",
+                RegistrationFailure.GUESS_CONTRADICTED,
+            )
+        starts = []
+        for k in range(N_NEAR):
+            spread = rng.normal(size=6) * (k > 0)  # the first is the guess itself
+            turn = rotation_exp(NEAR_GUESS_TURN * spread[:3])
+            aside = NEAR_GUESS_PX * spread[3:5] * centre[2] / self.camera.intrinsics[:2]
+            there = np.exp(NEAR_GUESS_SIZE * spread[5]) * (centre + np.append(aside, 0.0))
+            moved = RigidTransform(turn @ pose.rotation, there + turn @ (pose.translation - centre))
+            starts.append(self._in_map(moved, guess))
+        return self._best_in(self._beside(guess.frame), starts, ABOUT_GUESS)
+
+    def _beside(self, frame: int) -> View:
+        """The keyframe with dense points next to a frame."""
+        return min(self._dense[1], key=lambda view: abs(view.frame - frame))
+
+    def _in_map(self, pose: RigidTransform, seen: Sighting | GuessedPose) -> SimilarityTransform:
+        """The place of an object at a pose, metres, in a frame, in the unit that the points on it give."""
+        # The points are known where a keyframe sees them; the object stands still.
+        view = self._beside(seen.frame)
+        near = RigidTransform.from_matrix(view.camera_from_world.matrix @ np.linalg.inv(seen.camera_from_world.matrix))
+        unit = 1.0
+        for _ in range(3):
+            between = RigidTransform(near.rotation, near.translation / unit)
+            found = map_unit(between @ pose, self.edges, view, self._dense[0], self.camera)[0]
+            unit = found if found > 0.0 else unit
+        return placed(pose, seen, unit, self._metric)
 
 
 def _diverse(found: InView, speaking: Array, most: int, most_alike: int) -> list[int]:
