@@ -360,3 +360,24 @@ def test_the_nearest_object_is_drawn_over_the_others(recording):
     changed = np.argwhere(np.abs(drawn(**lost) - 90).sum(axis=2) > 0)
     assert len(changed)
     assert changed[:, 0].min() > 330
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[pose]\nposition_mm = [0, 0, 400]\nrotation_deg = [0, 0, 0]\n", "needs the number of its frame"),
+        (
+            "frame = 3\n[pose]\nposition_mm = [0, 0, 400]\nrotation_deg = [0, 0, 0]\n[parameters]\nbend = 1\n",
+            "undeformed",
+        ),
+        ("frame = 9999\n[pose]\nposition_mm = [0, 0, 400]\nrotation_deg = [0, 0, 0]\n", "frame 9999 has no pose"),
+        ("frame = 3\n[pose]\nposition_mm = [0, 0, -400]\nrotation_deg = [0, 0, 0]\n", "out of the image"),
+    ],
+)
+def test_guesses_that_a_map_cannot_use_are_refused(recording, tmp_path, refused, text, message):
+    folder, _ = recording
+    guess = tmp_path / "guess.toml"
+    guess.write_text(text)
+    register = ["register", folder / "map.h5", "--model", folder / "wedge.morph", "--camera", folder / "camera.yaml"]
+    assert message in refused(*map(str, [*register, "--guess", guess, "-o", tmp_path / "place"]))
+    assert not (tmp_path / "place").exists()

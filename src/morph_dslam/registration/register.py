@@ -65,15 +65,13 @@ def register(
         the file that has them. They have frame numbers.
     distance : rough distance of the object from the camera, metres; it may be off by half.
     region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
-    guess : file that says about where the object is in a frame of the map's recording; not beside other hints.
+    guess : file that says about where the object is in a frame of the map's recording.
 
     Raises
     ------
     RegistrationError
         If the object is not found, or a hint names a frame without a pose.
     """
-    if guess is not None and not (landmarks is None and distance is None and region is None):
-        raise RegistrationError("a guess says where the object is: leave out landmarks, distance and region")
     hints = Hints(
         () if landmarks is None else _sightings(landmarks, scene),
         distance,

@@ -169,10 +169,8 @@ class EdgeSearch:
 
         Raises RegistrationError if a hint names what is not there.
         """
-        if self._hints.clicks:
-            return self._polished(self._fitted_from(self._by_clicks()))
-        if self._hints.guess is not None:
-            return self._polished(self._fitted_from(self._by_guess(self._hints.guess)))
+        if self._hints.clicks or self._hints.guess is not None:
+            return self._polished(self._fitted_from(self._where_said()))
         found: list[EdgeRegistration] = []
         for view in self._searched():
             found = self._distinct(found + self._fitted_from(self._in_keyframe(view)))
@@ -362,9 +360,22 @@ class EdgeSearch:
         best = [*_diverse(found, by_all, N_BY_ALL, N_BY_ALL), *_diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)]
         return [placed(found.pose(k), view, float(unit[k]), self._metric) for k in dict.fromkeys(best)]
 
+    def _where_said(self) -> list[SimilarityTransform]:
+        """Where landmarks and a guess have the object."""
+        starts = self._by_clicks()
+        if self._hints.guess is not None:
+            starts += self._by_guess(self._hints.guess)
+        if not starts:
+            raise RegistrationError(
+                "no pose of the object explains the landmarks: give three or more in one frame, and check that points "
+                "and pixels belong together",
+                RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+            )
+        return starts
+
     def _by_clicks(self) -> list[SimilarityTransform]:
         """Where landmarks in single frames have the object, in every unit that the points on it allow."""
-        starts = []
+        starts = list[SimilarityTransform]()
         for click in self._hints.clicks:
             if len(click.points) < 3:
                 continue
@@ -376,12 +387,6 @@ class EdgeSearch:
             ]
             poses = (pose for each in meant for pose in solve_pnp(each.points, each.pixels, self.camera))
             starts += [self._in_map(pose, click) for pose in poses]
-        if not starts:
-            raise RegistrationError(
-                "no pose of the object explains the landmarks: give three or more in one frame, and check that points "
-                "and pixels belong together",
-                RegistrationFailure.LANDMARKS_DO_NOT_FIT,
-            )
         return starts
 
     def _by_guess(self, guess: GuessedPose) -> list[SimilarityTransform]:
