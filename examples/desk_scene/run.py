@@ -6,8 +6,8 @@ camera path `tags_shutter_corrected.txt`. The cube's true pose in frame 0 is fro
 which a real cube has rounded. `depth_mm`, the median distance of the measured depth of frame 0 from the cube's faces,
 says how far that pose is off itself: the faces that were measured are 6.5 mm nearer.
 
-Where it was found without a hint in a map of all frames, the cube is tracked through them, from colour alone and with
-depth; the videos are in output/. `still_mm` and `still_deg` are how far it seems to move on the desk while the true
+Where it was found without a hint in a map of all frames, the cube is tracked through them by their colour; the videos are
+in output/. (Depth in tracking turns it by up to 7 degrees here, see docs/tracking.md.) `still_mm` and `still_deg` are how far it seems to move on the desk while the true
 path of the camera goes by, mean and largest: the path's own errors of a few millimetres are in them.
 
 The last line gives the largest errors of the cube in frame 0 (centre or size, and angle modulo its 24 rotations), of
@@ -189,7 +189,6 @@ def track_cube(name: str, scene: md.Scene, placed: md.Registration, frames: Path
         registration=folder / "registration.json",
         first=0,
         output=folder / "run",
-        tracker=md.TrackerOptions(use_depth=scene.is_metric),
         overwrite=True,
     )
     md.track(options)
