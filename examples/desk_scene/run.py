@@ -6,9 +6,10 @@ camera path `tags_shutter_corrected.txt`. The cube's true pose in frame 0 is fro
 which a real cube has rounded. `depth_mm`, the median distance of the measured depth of frame 0 from the cube's faces,
 says how far that pose is off itself: the faces that were measured are 6.5 mm nearer.
 
-Where it was found without a hint in a map of all frames, the cube is tracked through them by their colour; the videos are
-in output/. (Depth in tracking turns it by up to 7 degrees here, see docs/tracking.md.) `still_mm` and `still_deg` are how far it seems to move on the desk while the true
-path of the camera goes by, mean and largest: the path's own errors of a few millimetres are in them.
+Where it was found without a hint in a map of all frames, the cube is tracked through them by their colour, and the
+videos are in output/. (Depth in tracking turns it by up to 7 degrees here, see docs/tracking.md.) `still_mm` and
+`still_deg` are how far it seems to move on the desk while the true path of the camera goes by, mean and largest: the
+path's own errors of a few millimetres are in them.
 
 The last line gives the largest errors of the cube in frame 0 (centre or size, and angle modulo its 24 rotations), of
 the places found, that of the camera's path from colour alone, how many of four maps give the cube without a hint and
