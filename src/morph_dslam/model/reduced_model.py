@@ -205,17 +205,19 @@ class ReducedModel:
         return DeformedState(self, self.vector(parameters), outside)
 
     def spread_parameters(self, count: int) -> Array:
-        """The default and ``count`` Sobol samples of the box (1 + count, d); without parameters the default.
+        """The default and ``count`` samples spread evenly over the box (1 + count, d); without parameters the default.
 
-        Unknown loads stay away.
+        Unknown loads stay away. The samples are multiples of powers of the generalised golden ratio g, the root of
+        g^(d + 1) = g + 1, modulo 1 (Roberts, The unreasonable effectiveness of quasirandom sequences, 2018). SciPy's
+        sequences are in `scipy.stats`, which takes as long to load, and as much memory, as all else that a model needs.
         """
-        from scipy.stats import qmc  # loading it takes as long as all else that a model needs
-
         d = len(self.study_parameters)
         if not d:
             return self.default[None]
-        samples = np.repeat(self.default[None], 1 + count, axis=0)
-        shares = qmc.Sobol(d, scramble=False).random(count)
+        samples, golden = np.repeat(self.default[None], 1 + count, axis=0), 2.0
+        for _ in range(50):
+            golden = (1.0 + golden) ** (1.0 / (d + 1))
+        shares = (0.5 + np.outer(np.arange(1, count + 1), golden ** -np.arange(1.0, d + 1))) % 1.0
         samples[1:, :d] = self.lower[:d] + shares * (self.upper - self.lower)[:d]
         return samples
 
