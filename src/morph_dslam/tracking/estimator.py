@@ -378,18 +378,34 @@ class Estimator:
         depths : of the p points, where a depth camera saw them.
         """
         normals = np.zeros_like(pixels) if normals is None else normals
-
-        def evaluate(state: State) -> tuple[float, Array, Array, Array]:
-            return self.evaluate(points, pixels, weights, state, normals, prior, depths)
-
-        found = minimise(evaluate, start, self.box, self.options.max_iterations, self.options.tolerance)
+        found = self.minimum(points, pixels, weights, start, normals, prior, depths)
         # A point on an outline gives one number, all others give two.
-        numbers = np.where((normals != 0.0).any(axis=1), 1, 2)
-        return self.finished(found, weights, numbers)
+        return self.finished(found, weights, 2 - (normals != 0.0).any(axis=1))
+
+    def minimum(
+        self,
+        points: BoundPoints,
+        pixels: Array,
+        weights: Array,
+        start: State,
+        normals: Array | None = None,
+        prior: Prior | None = None,
+        depths: PointDepths | None = None,
+    ) -> Minimum:
+        """The minimum that `estimate` finds, where nobody asks how exact it is."""
+        normals = np.zeros_like(pixels) if normals is None else normals
+        return minimise(
+            lambda state: self.evaluate(points, pixels, weights, state, normals, prior, depths),
+            start, self.box, self.options.max_iterations, self.options.tolerance,
+        )  # fmt: skip
 
     def fit(self, measured: Observations, start: State, prior: Prior | None = None) -> Estimate:
         """`estimate` from all that was measured in a frame."""
-        return self.estimate(
+        return self.finished(self.fitted(measured, start, prior), measured.weights, measured.numbers)
+
+    def fitted(self, measured: Observations, start: State, prior: Prior | None = None) -> Minimum:
+        """`minimum` of all that was measured in a frame."""
+        return self.minimum(
             measured.points, measured.pixels, measured.weights, start, measured.normals, prior, measured.depths
         )
 
