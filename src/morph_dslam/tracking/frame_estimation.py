@@ -42,6 +42,8 @@ Array = NDArray[np.float64]
 REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
+#: Other shapes are tried on at least so many points, where there are as many, and at most twice as many.
+SCOUTED = 80
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
 LEAST_SIGMA_PX = 0.1
 #: A start off a bound is this share of the range inside of it.
@@ -189,14 +191,23 @@ class FrameEstimation:
 
     def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
-        measurement, estimate, prior = attempt.measurement, attempt.estimate, attempt.prior
-        points, weights = self._reference.points, self._noise.weights(measurement.spread, measurement.valid)
-        cost = self._estimator.evaluate(points, measurement.pixels, weights, estimate.state, prior=prior)[0]
-        found = [self._scout.minimum(points, measurement.pixels, weights, start, prior=prior) for start in starts]
+        measurement, prior, state = attempt.measurement, attempt.prior, attempt.estimate.state
+        weights, valid = self._noise.weights(measurement.spread, measurement.valid), np.flatnonzero(measurement.valid)
+        every = (self._reference.points, measurement.pixels, weights)
+        rows = valid[:: 1 + len(valid) // SCOUTED]
+        # So many times the weight, lest a prior count for more among few.
+        few = (every[0].take(rows), every[1][rows], weights[rows] * (len(valid) / max(len(rows), 1)))
+        found = [self._scout.minimum(*few, start, prior=prior) for start in starts]
         best = min(found, key=lambda other: other.cost, default=None)
-        if best is None or best.cost > CLEARLY_BETTER * cost:
-            return attempt
+        for points in (few, every):
+            if best is None or self._cost(points, best.state, prior) > CLEARLY_BETTER * self._cost(
+                points, state, prior
+            ):
+                return attempt
         return self._trimmed(measurement, best.state, prior)
+
+    def _cost(self, measured: tuple[BoundPoints, Array, Array], state: State, prior: Prior | None) -> float:
+        return self._estimator.evaluate(*measured, state, prior=prior)[0]
 
     def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate from the supporting points and the outline together; searched far first, then near."""

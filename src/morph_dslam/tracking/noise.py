@@ -122,6 +122,37 @@ def _overlaps(pixels, window):
     return values, columns, begins
 
 
+def quadratic(rows: Array, correlation: Correlation, others: Array | None = None) -> Array:
+    """sum_ij K_ij W_i' V_j (n, n) of W and V (p, 2, n), W itself by default, with correlation K (p, p)."""
+    others = rows if others is None else others
+    if isinstance(correlation, scipy.sparse.csr_array):
+        return _sparse_quadratic(correlation.data, correlation.indices, correlation.indptr, rows, others)
+    spread = np.asarray(correlation @ others.reshape(len(others), -1)).reshape(others.shape)
+    return np.tensordot(rows, spread, axes=([0, 1], [0, 1]))
+
+
+@njit(cache=True, nogil=True)
+def _sparse_quadratic(values, columns, begins, rows, others):
+    """`quadratic` with K as the arrays of a sparse matrix by rows; points whose row of W is zero cost nothing."""
+    count, size = rows.shape[2], others.shape[2]
+    found, spread = np.zeros((count, size)), np.empty((2, size))
+    for i in range(len(rows)):
+        if not rows[i].any():
+            continue
+        spread[:] = 0.0
+        for e in range(begins[i], begins[i + 1]):
+            value, other = values[e], others[columns[e]]
+            for c in range(2):
+                for b in range(size):
+                    spread[c, b] += value * other[c, b]
+        for c in range(2):
+            for a in range(count):
+                entry, line = rows[i, c, a], found[a]
+                for b in range(size):
+                    line[b] += entry * spread[c, b]
+    return found
+
+
 #: An estimate that takes up more of the variance leaves too little, as a share, to tell how large it is.
 LEAST_LEFT = 0.25
 

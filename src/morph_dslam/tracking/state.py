@@ -55,6 +55,11 @@ class BoundPoints:
         rest = np.concatenate([self.rest, other.rest])
         return BoundPoints(surface, rest, self.field.with_modes(modes))
 
+    def take(self, rows: NDArray[np.int64]) -> BoundPoints:
+        """The points at ``rows`` (k,)."""
+        field = self.field.with_modes(self.field.modes[:, rows])
+        return BoundPoints(self.surface.take(rows), self.rest[rows], field)
+
     def in_camera(self, state: State) -> Array:
         """Positions (p, 3) in the camera frame, metres."""
         pose = state.camera_from_object
