@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.render.rasteriser import corner_weights, is_inside, pack_nodes, pixel_window, visible_points
+from morph_dslam.render.rasteriser import (
+    corner_weights,
+    covered_steps,
+    is_inside,
+    pack_nodes,
+    pixel_window,
+    visible_points,
+)
 from morph_dslam.tracking.binding import Drawing, View, facing, signed_areas
 from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
 
@@ -66,7 +73,7 @@ class ReferenceAppearance:
         self._camera = camera
         sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
         # One picture below the other, so that a triangle's place says which one it is from.
-        self._texture = np.ascontiguousarray(np.concatenate(normalized_images))
+        self._texture = pack_texture(np.concatenate(normalized_images))
         self._coordinates = np.empty((len(self._triangles), 3, 3))
         self.facing = np.empty(len(self._triangles), dtype=bool)
         for number, view in enumerate(views):
@@ -95,17 +102,36 @@ class ReferenceAppearance:
         return Rendering(image, depth, triangle_ids)
 
 
+#: By so much, pixels of the texture, places on a flat triangle may be off.
+FLAT_PX = 0.02
+#: Places in the texture are whole numbers of these parts of a pixel.
+PARTS = 256
+
+
+@njit(cache=True, nogil=True)
+def pack_texture(grey):
+    """A texture (h, w) uint8 with the neighbours to the right, below and diagonal of each pixel in one number, uint32.
+
+    What is interpolated then takes one access. Beyond the border, which is never interpolated towards, is zero.
+    """
+    height, width = grey.shape
+    packed = np.zeros((height, width), np.uint32)
+    for row in range(height):
+        for column in range(width):
+            for i in range(min(2, height - row)):
+                for j in range(min(2, width - column)):
+                    packed[row, column] |= np.uint32(grey[row + i, column + j]) << np.uint32(16 * i + 8 * j)
+    return packed
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _grey_at(texture, x, y):
-    """Grey level of a texture at a place, bilinearly; outside it is its border."""
-    last_row, last_column = texture.shape[0] - 1, texture.shape[1] - 1
-    s, t = min(max(x, 0.0), last_column), min(max(y, 0.0), last_row)
-    s0, t0 = int(s), int(t)
-    s1, t1 = min(s0 + 1, last_column), min(t0 + 1, last_row)
-    a, b = s - s0, t - t0
-    above = (1.0 - a) * texture[t0, s0] + a * texture[t0, s1]
-    below = (1.0 - a) * texture[t1, s0] + a * texture[t1, s1]
-    return np.uint8((1.0 - b) * above + b * below + 0.5)
+def _grey_at(packed, x, y):
+    """Grey level of a packed texture at a place, bilinearly; x and y are in `PARTS` of a pixel, rounded down."""
+    column, row = int(x), int(y)
+    four, right, below = np.int64(packed[row >> 8, column >> 8]), column & 255, row & 255
+    # Upper and lower row at once: each of the sums has sixteen bits.
+    both = (four & 0x00FF00FF) * (PARTS - right) + ((four >> 8) & 0x00FF00FF) * right
+    return np.uint8(((both & 0xFFFF) * (PARTS - below) + (both >> 16) * below + 32768) >> 16)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -117,36 +143,97 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     pixels, depths, triangles, closed : see `rasterise`.
     coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth
         in the camera that took it, and that depth; outside it is its border
-    texture : (H, W) uint8.
+    texture : (H, W) of `pack_texture`.
     image, depth, triangle_ids : (h, w) uint8, float32, the unit of ``depths``, and int32; changed where the surface is
         nearest.
     """
-    nodes = pack_nodes(pixels, depths)
+    nodes, texel = pack_nodes(pixels, depths), np.empty((3, 2))
     for t in range(triangles.shape[0]):
-        triangle = triangles[t]
-        left, right, top, bottom = pixel_window(nodes, triangle, closed, *depth.shape)
-        if bottom < top:
+        triangle, corners = triangles[t], coordinates[t]
+        window = pixel_window(nodes, triangle, closed, *depth.shape)
+        if window[3] < window[2]:
             continue
-        b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
-        q0, q1, q2 = nodes[triangle[0], 2], nodes[triangle[1], 2], nodes[triangle[2], 2]
-        corners = coordinates[t]
-        for row in range(top, bottom + 1):
-            b0_left, b1_left = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
-            for column in range(left, right + 1):
-                b0, b1 = b0_left + (column - left) * b0_right, b1_left + (column - left) * b1_right
-                b2 = 1.0 - b0 - b1
-                if not is_inside(b0, b1, b2):
-                    continue
-                w0, w1, w2 = b0 * q0, b1 * q1, b2 * q2
-                z = 1.0 / (w0 + w1 + w2)
-                if not z < depth[row, column]:
-                    continue
+        for i in range(3):
+            for k in range(2):
+                texel[i, k] = PARTS * corners[i, k] / corners[i, 2] + 0.5
+        if _is_flat(nodes, triangle, corners, texel, texture):
+            _draw_flat(t, nodes, triangle, window, texel, texture, image, depth, triangle_ids)
+        else:
+            _draw_deep(t, nodes, triangle, window, corners, texture, image, depth, triangle_ids)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_flat(nodes, triangle, corners, texel, texture):
+    """Whether a triangle's place in the texture may be taken as linear in the image, and is all inside of it.
+
+    It is a ratio of linear functions. Where the denominators differ by a share e between corners, it differs from a
+    linear function by no more than e / 4 of its own range.
+    """
+    low, high, extent = np.inf, -np.inf, 0.0
+    for i in range(3):
+        far = nodes[triangle[i], 2] * corners[i, 2]
+        low, high = min(low, far), max(high, far)
+    for k in range(2):
+        least, most = min(texel[0, k], texel[1, k], texel[2, k]), max(texel[0, k], texel[1, k], texel[2, k])
+        if not (least >= PARTS and most < PARTS * (texture.shape[1 - k] - 1)):
+            return False
+        extent += most - least
+    return extent * (high - low) < 4.0 * PARTS * FLAT_PX * low
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_flat(t, nodes, triangle, window, texel, texture, image, depth, triangle_ids):
+    """Draw triangle ``t`` with places in the texture, in `PARTS`, linear in the image; row by row."""
+    left, right, top, bottom = window
+    b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
+    q2, x2, y2 = nodes[triangle[2], 2], texel[2, 0], texel[2, 1]
+    q0, x0, y0 = nodes[triangle[0], 2] - q2, texel[0, 0] - x2, texel[0, 1] - y2
+    q1, x1, y1 = nodes[triangle[1], 2] - q2, texel[1, 0] - x2, texel[1, 1] - y2
+    q_right, x_right, y_right = (
+        b0_right * q0 + b1_right * q1,
+        b0_right * x0 + b1_right * x1,
+        b0_right * y0 + b1_right * y1,
+    )
+    b2_right = -b0_right - b1_right
+    steps = 1.0 / b0_right, 1.0 / b1_right, 1.0 / b2_right
+    for row in range(top, bottom + 1):
+        b0, b1 = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
+        first, last = covered_steps(b0, b0_right, steps[0], 0.0, float(right - left))
+        first, last = covered_steps(b1, b1_right, steps[1], first, last)
+        first, last = covered_steps(1.0 - b0 - b1, b2_right, steps[2], first, last)
+        first, last = np.ceil(first), np.floor(last)
+        q, x, y = q2 + b0 * q0 + b1 * q1, x2 + b0 * x0 + b1 * x1, y2 + b0 * y0 + b1 * y1
+        for k in range(int(first), int(last) + 1):
+            z, column = np.float32(1.0 / (q + k * q_right)), left + k
+            if z < depth[row, column]:
                 depth[row, column], triangle_ids[row, column] = z, t
-                # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
-                scale = 1.0 / (w0 * corners[0, 2] + w1 * corners[1, 2] + w2 * corners[2, 2])
-                x = (w0 * corners[0, 0] + w1 * corners[1, 0] + w2 * corners[2, 0]) * scale
-                y = (w0 * corners[0, 1] + w1 * corners[1, 1] + w2 * corners[2, 1]) * scale
-                image[row, column] = _grey_at(texture, x, y)
+                image[row, column] = _grey_at(texture, x + k * x_right, y + k * y_right)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_deep(t, nodes, triangle, window, corners, texture, image, depth, triangle_ids):
+    """Draw triangle ``t`` pixel by pixel, exactly."""
+    left, right, top, bottom = window
+    b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
+    q0, q1, q2 = nodes[triangle[0], 2], nodes[triangle[1], 2], nodes[triangle[2], 2]
+    for row in range(top, bottom + 1):
+        b0_left, b1_left = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
+        for column in range(left, right + 1):
+            b0, b1 = b0_left + (column - left) * b0_right, b1_left + (column - left) * b1_right
+            b2 = 1.0 - b0 - b1
+            if not is_inside(b0, b1, b2):
+                continue
+            w0, w1, w2 = b0 * q0, b1 * q1, b2 * q2
+            z = 1.0 / (w0 + w1 + w2)
+            if not z < depth[row, column]:
+                continue
+            depth[row, column], triangle_ids[row, column] = z, t
+            # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
+            scale = 1.0 / (w0 * corners[0, 2] + w1 * corners[1, 2] + w2 * corners[2, 2])
+            x = (w0 * corners[0, 0] + w1 * corners[1, 0] + w2 * corners[2, 0]) * scale
+            y = (w0 * corners[0, 1] + w1 * corners[1, 1] + w2 * corners[2, 1]) * scale
+            x, y = min(max(x, 0.0), texture.shape[1] - 1), min(max(y, 0.0), texture.shape[0] - 1)
+            image[row, column] = _grey_at(texture, PARTS * x + 0.5, PARTS * y + 0.5)
 
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
