@@ -24,6 +24,7 @@ from morph_dslam.render.rasteriser import (
     visible_points,
 )
 from morph_dslam.tracking.binding import Drawing, View, facing, signed_areas
+from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
 
 Array = NDArray[np.float64]
@@ -306,7 +307,7 @@ def visible_surface(
     """
     same_side = facing(view, triangles[points.triangles]) == appearance.facing[points.triangles]
     depths = positions[:, 2]
-    tolerance = DEPTH_TOLERANCE * float(np.median(depths))
+    tolerance = DEPTH_TOLERANCE * middle(depths)
     return same_side & visible_points(pixels, depths, rendering.depth, tolerance)
 
 

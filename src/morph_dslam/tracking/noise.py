@@ -242,7 +242,7 @@ class PointNoise:
         if np.isinf(common) or not used.any():
             return used.astype(float)
         variance = (spread**2 + common) ** self.power
-        return np.where(used, _middle(variance[used]) / variance, 0.0)
+        return np.where(used, middle(variance[used]) / variance, 0.0)
 
     def learn(self, spread: Array, residuals: Array, used: NDArray[np.bool_]) -> None:
         """Take in the residuals (p, 2) of a frame: of the better half of the points and of the other."""
@@ -250,11 +250,11 @@ class PointNoise:
         if used.sum() < LEAST_POINTS:
             return
         spread, length = spread[used], np.linalg.norm(residuals[used], axis=1)
-        better = spread <= _middle(spread)
+        better = spread <= middle(spread)
         if better.all():
             return
         moments = np.array(
-            [[_middle(spread[half]) ** 2, (_middle(length[half]) / MEDIAN_OF_PAIR) ** 2] for half in (better, ~better)]
+            [[middle(spread[half]) ** 2, (middle(length[half]) / MEDIAN_OF_PAIR) ** 2] for half in (better, ~better)]
         )
         if moments[:, 1].max() < LEAST_SPREAD_PX**2:
             return  # the reference picture itself, which tells nothing of noise
@@ -262,7 +262,7 @@ class PointNoise:
         self._moments = before + LEARNING_RATE * (moments - before)
 
 
-def _middle(values: Array) -> float:
+def middle(values: Array) -> float:
     """The upper median of numbers (n,); numpy's own takes five times as long for some hundred."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
