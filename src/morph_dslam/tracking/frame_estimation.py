@@ -109,6 +109,16 @@ def with_unobservable_at_default(model: ReducedModel, estimate: Estimate) -> Sta
     return replace(state, parameters=np.where(_unobservable(model, estimate), model.default, state.parameters))
 
 
+def a_turn_back(model: ReducedModel, start: State, estimate: Estimate, angles: Sequence[str]) -> State:
+    """A start with ``angles`` about an axis of revolution, by name, that ended at a bound the same a turn back.
+
+    Their range is of two turns: from its middle they may go on either way.
+    """
+    ended = estimate.at_bound & [parameter.name in angles for parameter in model.parameters]
+    turns = 2.0 * np.pi * np.sign(start.parameters)
+    return replace(start, parameters=np.where(ended, start.parameters - turns, start.parameters))
+
+
 def _unobservable(model: ReducedModel, estimate: Estimate) -> NDArray[np.bool_]:
     """Which parameters (d,) the images did not determine."""
     return ~(estimate.parameter_std < UNOBSERVABLE_SHARE * (model.upper - model.lower))

@@ -27,6 +27,7 @@ from morph_dslam.tracking.binding import (
     View,
     bind_pixels,
     draw_view,
+    facing,
     foreshortening,
     signed_areas,
     view_of,
@@ -92,8 +93,7 @@ class SurfaceSamples:
             reactions={},
         )
         chosen = points.triangles
-        corners = SurfacePoints(np.repeat(chosen, 3), np.tile(np.eye(3), (N_SAMPLES, 1)))
-        self._corners = BoundPoints.from_surface(model, corners)
+        self._corners = BoundPoints.from_surface(model, points).corners(model)
         normals = triangle_normals(model.nodes, model.triangles[chosen])
         self._areas = 0.5 * np.linalg.norm(normals, axis=1)
 
@@ -243,6 +243,10 @@ class ReferenceView:
                 for mesh, points in zip(meshes, bound, strict=True)
             ]
         )
+        self._corners = drawn.triangles[self.points.surface.triangles].ravel()
+        self._is_front = np.concatenate(
+            [facing(mesh, drawn.triangles[p.surface.triangles]) for mesh, p in zip(meshes, bound, strict=True)]
+        )
         self._mask, self._mesh = masks[0], meshes[0]
         self.outline: Outline | None = None
         self.outline_alone = not len(self.points)
@@ -312,20 +316,20 @@ class ReferenceView:
         ``offsets`` (p, 2) says how far from there, pixels, the points are about to be; None where nothing is known but
         the state.
         """
-        drawn, camera = self.surface.model, self._estimator.camera
+        camera = self._estimator.camera
         with stage("render"):
-            view = view_of(drawn, camera, state)
+            view = view_of(self.surface.model, camera, state)
             rendering = self.appearance.render(view)
         with stage("correct"):
             positions = self.points.in_camera(state)
             predicted = camera.project(positions)
+            tolerance = DEPTH_TOLERANCE * middle(positions[:, 2])
             visible = visible_surface(
-                self.points.surface, positions, predicted, view, drawn.triangles, self.appearance, rendering
-            )
+                view.nodes[self._corners], view.pixels[self._corners], self._is_front, self._least_broadness,
+                positions, predicted, rendering.depth, tolerance,
+            )  # fmt: skip
             if picture.occluder_depth is not None:
-                tolerance = DEPTH_TOLERANCE * middle(positions[:, 2])
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
-            visible &= foreshortening(view, drawn.triangles[self.points.surface.triangles]) >= self._least_broadness
             found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets)
         return replace(found, drawing=Drawing(state, view, rendering.triangle_ids, rendering.depth))
 

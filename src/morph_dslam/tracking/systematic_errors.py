@@ -28,7 +28,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State, project_with_jacobian
 
@@ -155,7 +154,7 @@ class SystematicErrors:
     ) -> None:
         self._estimator, self._points, self._still = estimator, points, still
         self._misfit = ReferenceMisfit()
-        self._corners = _corners(estimator, points)
+        self._corners = points.corners(estimator.model)
         edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
         size = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -335,14 +334,6 @@ def inverse_of_seen(hessian: Array, scale: Array) -> Array:
 def _by_parts(parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
     """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
     return np.concatenate([of_state(part.state)[part.rows] for part in parts])
-
-
-def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
-    """The three corners of each point's triangle, (3 p) points."""
-    surface = SurfacePoints(np.repeat(points.surface.triangles, 3), np.tile(np.eye(3), (len(points), 1)))
-    model = estimator.model
-    nodes = model.triangles[points.surface.triangles].ravel()
-    return BoundPoints(surface, model.nodes[nodes], model.displacement.with_modes(model.displacement.modes[:, nodes]))
 
 
 def _edges(camera: Camera, corners: BoundPoints, state: State) -> Array:

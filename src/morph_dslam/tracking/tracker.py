@@ -24,7 +24,12 @@ from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
-from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
+from morph_dslam.tracking.frame_estimation import (
+    a_turn_back,
+    at_constant_velocity,
+    new_filter,
+    with_unobservable_at_default,
+)
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
@@ -507,7 +512,8 @@ class Tracker:
             self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
-        self._start = with_unobservable_at_default(self.model, estimate)
+        angles = self._registration.per_sequence
+        self._start = a_turn_back(self.model, with_unobservable_at_default(self.model, estimate), estimate, angles)
         if self.options.start == "constant-velocity":
             self._start = at_constant_velocity(self._velocity_base, self._start)
         self._supported = inliers
