@@ -10,7 +10,7 @@ from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.binding import View, view_of
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured
+from morph_dslam.tracking.measurement import ReferenceAppearance, draw_textured, pack_texture
 from morph_dslam.tracking.patches import (
     FLOW_WINDOW,
     NEUTRAL,
@@ -140,17 +140,18 @@ def draw_in_two_passes(pixels, depths, triangles, coordinates, texture, closed, 
 @pytest.mark.parametrize("closed", [False, True])
 def test_drawing_in_one_pass_equals_drawing_in_two(closed):
     model = bent_sheet_model(22, 16)
-    texture = np.random.default_rng(4).integers(0, 256, (480, 640)).astype(np.uint8)
+    # As smooth as places in it are rounded.
+    texture = cv2.GaussianBlur(printed_texture(480, 640, seed=4), (0, 0), 3.0)
     view, other = (view_of(model, CAMERA, sheet_state(bend)) for bend in (0.0, 0.15))
     # A picture taken from far away: all depths are the same.
     pictures, places = [], np.pad(view.pixels, ((0, 0), (0, 1)), constant_values=1.0)[model.triangles]
-    for draw in (draw_textured, draw_in_two_passes):
+    for draw, kept in ((draw_textured, pack_texture(texture)), (draw_in_two_passes, texture)):
         image, depth = np.full((480, 640), NEUTRAL, np.uint8), np.full((480, 640), np.inf, np.float32)
         # Something is drawn there already, nearer than the right half.
         depth[:, 320:400] = 0.01
         depths = np.ascontiguousarray(other.nodes[:, 2])
         ids = np.full((480, 640), -1, np.int32)
-        draw(other.pixels, depths, model.triangles, places, texture, closed, image, depth, ids)
+        draw(other.pixels, depths, model.triangles, places, kept, closed, image, depth, ids)
         pictures.append((image, depth, ids))
     (image, depth, ids), (expected, expected_depth, expected_ids) = pictures
     # Where two triangles meet, either may be the nearer one.

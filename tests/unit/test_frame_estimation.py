@@ -1,5 +1,7 @@
 """Where a frame's estimate starts: against local minima, at constant velocity, and by what frames have in common."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, State
 from morph_dslam.tracking.frame_estimation import (
     ShapeSearch,
+    a_turn_back,
     at_constant_velocity,
     new_filter,
     temporal_facts,
@@ -65,6 +68,20 @@ def test_only_undetermined_parameters_return_to_their_default():
     kept = with_unobservable_at_default(model, found)
     assert kept.parameters[1] == 0.0
     np.testing.assert_array_equal(kept.parameters[[0, 2]], found.state.parameters[[0, 2]])
+
+
+def test_an_angle_about_the_axis_that_ends_at_a_bound_starts_a_turn_back():
+    model = bent_sheet_model(22, 16)
+    name = PARAMETERS[1].name
+    estimate = replace(determined(model), at_bound=np.array([True, True, False]))
+    start = State(np.array([0.02, 2.0 * np.pi - 0.01, 0.3]), POSE)
+    back = a_turn_back(model, start, estimate, (name,))
+    np.testing.assert_allclose(back.parameters, [0.02, -0.01, 0.3], atol=1e-12)
+    again = a_turn_back(model, replace(start, parameters=-start.parameters), estimate, (name,))
+    np.testing.assert_allclose(again.parameters, [-0.02, 0.01, -0.3], atol=1e-12)
+    # One inside its range, and what is no such angle, stay.
+    assert a_turn_back(model, start, determined(model), (name,)).parameters[1] == start.parameters[1]
+    assert a_turn_back(model, start, estimate, ()).parameters[1] == start.parameters[1]
 
 
 def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():

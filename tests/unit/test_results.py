@@ -8,7 +8,7 @@ import pytest
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.tracking.binding import view_of
+from morph_dslam.tracking.binding import facing, view_of
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, State
 from morph_dslam.tracking.measurement import ReferenceAppearance, visible_surface
@@ -126,18 +126,19 @@ def test_points_hidden_by_the_object_or_turned_away_are_not_visible():
     normalized = np.full((480, 640), 90, np.uint8)
     appearance = ReferenceAppearance(model, CAMERA, [normalized], [view_of(model, CAMERA, front)])
 
-    def visible(state):
-        view = view_of(model, CAMERA, state)
-        positions = points.in_camera(state)
+    is_front = facing(view_of(model, CAMERA, front), model.triangles)
+
+    def visible(state, broadness=0.0):
+        positions, corners = points.in_camera(state), points.corners(model).in_camera(state)
+        depth = appearance.render(view_of(model, CAMERA, state)).depth
         return visible_surface(
-            points.surface,
-            positions,
-            CAMERA.project(positions),
-            view,
-            model.triangles,
-            appearance,
-            appearance.render(view),
-        ).tolist()
+            corners, CAMERA.project(corners), is_front, np.full(4, broadness), positions, CAMERA.project(positions),
+            depth, 0.001,
+        ).tolist()  # fmt: skip
 
     assert visible(front) == [True, True, False, False]
     assert visible(State(np.zeros(3), BACK)) == [False, False, False, False]
+    # Half of the square of 0.2 m, at any distance: its area times the squared focal length.
+    area = 0.5 * 0.2**2 * CAMERA.fx * CAMERA.fy
+    assert visible(front, 0.99 * area) == [True, True, False, False]
+    assert visible(front, 1.01 * area) == [False, False, False, False]

@@ -14,6 +14,7 @@ from morph_dslam.tracking.covariance import (
     BoundPart,
     SharedErrors,
     gaussian_factor,
+    trace_of_share,
 )
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
 from morph_dslam.tracking.observability import position_std
@@ -294,3 +295,14 @@ def test_of_many_points_some_tell_what_all_have_in_common():
     pairs &= np.abs(apart).max(axis=2) >= WINDOW
     expected = np.sum((wave[:, None, :, 0] * wave[None, :, :, 0]).sum(axis=2)[pairs]) / (2 * pairs.sum())
     assert common.in_common(wave, common.n_pairs(used))[0, 0] == pytest.approx(expected, rel=0.05)
+
+
+def test_the_share_of_a_part_is_counted_on_what_the_whole_sees():
+    """Five unknowns of sizes from 1e-3 to 10, one of which nothing tells of."""
+    rng, scale = np.random.default_rng(0), np.array([1e-3, 10.0, 1.0, 0.1, 1.0])
+    rows = rng.standard_normal((30, 5)) / scale
+    rows[:, 4] = 0.0
+    whole, part = rows.T @ rows, rows[:12].T @ rows[:12]
+    scaled = np.linalg.pinv(whole * np.outer(scale, scale), 1e-10) @ (part * np.outer(scale, scale))
+    assert trace_of_share(whole, part, scale) == pytest.approx(np.trace(scaled), rel=1e-9)
+    assert trace_of_share(whole, whole, scale) == pytest.approx(4.0, rel=1e-9)

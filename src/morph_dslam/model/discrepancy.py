@@ -14,9 +14,9 @@ from functools import cached_property
 
 import h5py
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial.distance import cdist
 
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.model.field_storage import read_array
@@ -60,7 +60,7 @@ class DiscrepancyBasis:
         known = self._known.get(id(positions))
         if known is not None and known[0] is positions:
             return known[1]
-        found = self._covariance(positions) @ self.precision
+        found = self.influence_on(positions)
         if len(self._known) >= KEPT:
             self._known.clear()
         self._known[id(positions)] = positions, found
@@ -71,11 +71,28 @@ class DiscrepancyBasis:
         """Positions and the influence on them, by the array that they are."""
         return {}
 
+    def influence_on(self, positions: Array) -> Array:
+        """`influence` that nobody keeps."""
+        return self._covariance(positions) @ self.precision
+
     def _covariance(self, positions: Array) -> Array:
-        """Matern 5/2 of the distances to the centres (n, m)."""
-        distance = cdist(positions, self.centres)
-        scaled = np.sqrt(5.0) * distance / self.length
-        return (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled) + JITTER * (distance == 0.0)
+        return matern(np.ascontiguousarray(positions), self.centres, self.length)
+
+
+@njit(cache=True, nogil=True)
+def matern(points, centres, length):
+    """Matern covariance (n, m) of order 5/2 between points (n, 3) and centres (m, 3), of unit variance."""
+    found = np.empty((len(points), len(centres)))
+    for i in range(len(points)):
+        for j in range(len(centres)):
+            squared = 0.0
+            for k in range(3):
+                squared += (points[i, k] - centres[j, k]) ** 2
+            scaled = np.sqrt(5.0 * squared) / length
+            found[i, j] = (1.0 + scaled + scaled * scaled / 3.0) * np.exp(-scaled)
+            if squared == 0.0:
+                found[i, j] += JITTER
+    return found
 
 
 @dataclass(frozen=True)

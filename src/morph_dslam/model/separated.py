@@ -39,8 +39,25 @@ def combine_modes(rows, modes):
     return result
 
 
-#: Numbers at the corners of points that are made at a time.
-_MOST_AT_CORNERS = 1 << 21
+@njit(cache=True, nogil=True)
+def interpolate(modes, corners, weights, found):
+    """Fill modes (m, p, k) at points of a mesh from those at its nodes (n,).
+
+    Parameters
+    ----------
+    modes : (m, n, k).
+    corners, weights : (p, c) node indices and what each counts.
+    found : (m, p, k), to be filled.
+    """
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            for k in range(found.shape[2]):
+                total = 0.0
+                for c in range(corners.shape[1]):
+                    total += weights[j, c] * modes[i, corners[j, c], k]
+                found[i, j, k] = total
+
+
 #: Numbers that are added up at a time: they stay in the processor's nearest memory meanwhile.
 _AT_A_TIME = 384
 
@@ -160,9 +177,5 @@ class SeparatedField:
         precision : of the modes at the points.
         """
         modes = np.empty((self.n_modes, len(corners), self.modes.shape[2]), precision)
-        # Not all modes of many points at once: at their corners these would be several times as large as the result.
-        step = max(1, _MOST_AT_CORNERS // max(corners.size * modes.shape[2], 1))
-        for begin in range(0, self.n_modes, step):
-            part = slice(begin, begin + step)
-            np.einsum("pc,mpcx->mpx", weights, self.modes[part][:, corners], out=modes[part], casting="same_kind")
+        interpolate(self.modes, corners, weights, modes)
         return self.with_modes(modes)

@@ -79,6 +79,23 @@ def is_inside(b0, b1, b2):
     return min(b0, b1, b2) >= -EDGE_TOLERANCE
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def covered_steps(weight, slope, inverse, first, last):
+    """Where steps along a row, no less than ``first`` and no more than ``last``, begin and end to be covered.
+
+    Parameters
+    ----------
+    weight, slope : a corner's weight at step 0, and by how much it grows at each.
+    inverse : one over ``slope``.
+    first, last : not whole numbers; there is no step where the last is less than the first.
+    """
+    if slope > 0.0:
+        return max(first, (-EDGE_TOLERANCE - weight) * inverse), last
+    if slope < 0.0:
+        return first, min(last, (-EDGE_TOLERANCE - weight) * inverse)
+    return first, last if weight >= -EDGE_TOLERANCE else -1.0
+
+
 Array = NDArray[np.float64]
 
 

@@ -27,7 +27,7 @@ from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.rolling_shutter import RowPoses
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
-from morph_dslam.tracking.estimator import Estimator, Prior, moved
+from morph_dslam.tracking.estimator import Estimator, Prior, State, moved
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
@@ -171,6 +171,8 @@ class Anchoring:
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         self._squared_px, self._n_other = reference.redundancy * FIRST_SIGMA_PX**2, 0
         self.has_moved = False
+        #: What the points of a frame's state said last: outline and filter mostly leave that as it is.
+        self._judged: tuple[PosePrior, State, bool] | None = None
 
     def prior(self, known: PosePrior | None) -> Prior | None:
         """What the map tells of the pose; None if the camera is lost or the object has moved."""
@@ -184,6 +186,14 @@ class Anchoring:
         Both must hold: it is farther off than the registration's usual error, and than the standard
         deviations of both poses explain.
         """
+        state = attempt.estimate.state
+        if self._judged is not None and self._judged[0] is known and self._judged[1] is state:
+            return self._judged[2]
+        contradicts = self._is_elsewhere(known, attempt)
+        self._judged = known, state, contradicts
+        return contradicts
+
+    def _is_elsewhere(self, known: PosePrior, attempt: PoseHypothesis) -> bool:
         pose, covariance = self._by_points_alone(attempt)
         points = self.reference.points.rest[attempt.inliers]
         apart = np.sqrt(np.mean(np.sum((pose.apply(points) - known.pose.apply(points)) ** 2, axis=1)))

@@ -176,3 +176,22 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
     floored = np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)
     return max(sigma, LEAST_SPREAD_PX), variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)
+
+
+@njit(cache=True, nogil=True)
+def trace_of_share(whole, part, scale):
+    """tr(H^+ P) of a Hessian H (n, n), on what it sees, and a part P of it.
+
+    Parameters
+    ----------
+    whole, part : (n, n), H and P.
+    scale : (n,) of the unknowns, which makes them comparable.
+    """
+    sizes = np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(whole * sizes)
+    part, trace = part * sizes, 0.0
+    for k in range(len(values)):
+        if values[k] > EIGENVALUE_FLOOR * values[-1]:
+            along = np.ascontiguousarray(vectors[:, k])
+            trace += along @ part @ along / values[k]
+    return trace

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import KDTree
@@ -81,14 +82,12 @@ class _Quadratic:
 
         ``influence`` (p, m) is the centres' on them.
         """
-        return cls(weighted_gram(weights, influence), (influence.T @ forces).T.ravel())
+        return cls(symmetric_gram(weights, influence), (influence.T @ forces).T.ravel())
 
     @classmethod
     def of_residuals(cls, rows: Array, residuals: Array, weights: Array, influence: Array) -> _Quadratic:
         """By residuals (p, k) with ``weights`` (p,) and their derivatives (p, k, 3) by p displacements."""
-        curvature = np.einsum("p,pka,pkb->pab", weights, rows, rows)
-        forces = np.einsum("p,pka,pk->pa", weights, rows, residuals)
-        return cls.of_rows(curvature, forces, influence)
+        return cls.of_rows(*_curvature(np.ascontiguousarray(rows), residuals, weights), influence)
 
     def minimum(self) -> Array:
         """The step (m, 3) that lowers the cost most."""
@@ -107,6 +106,107 @@ def weighted_gram(weights: Array, influence: Array) -> Array:
     weighted = (weights[..., None] * influence[:, None, None]).reshape(rows, 9 * count)
     blocks = (influence.T @ weighted).reshape(count, 3, 3, count)
     return blocks.transpose(1, 0, 2, 3).reshape(3 * count, 3 * count)
+
+
+#: The components of a symmetric 3 x 3 matrix.
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def symmetric_gram(weights: Array, influence: Array) -> Array:
+    """`weighted_gram` of symmetric weights: six blocks in place of nine."""
+    count, size = influence.shape[1], 3 * influence.shape[1]
+    blocks = influence.T @ _weighted_influence(weights, influence)
+    result = np.empty((size, size))
+    for k, (a, b) in enumerate(PAIRS):
+        block = blocks[:, k * count : (k + 1) * count]
+        result[a * count : (a + 1) * count, b * count : (b + 1) * count] = block
+        result[b * count : (b + 1) * count, a * count : (a + 1) * count] = block
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _weighted_influence(weights, influence):
+    """Influence (p, m) times each of the `PAIRS` of ``weights`` (p, 3, 3), side by side: (p, 6 m)."""
+    points, count = influence.shape
+    found = np.empty((points, 6 * count))
+    for j in range(points):
+        for k, (a, b) in enumerate(PAIRS):
+            line = found[j, k * count : (k + 1) * count]
+            for i in range(count):
+                line[i] = weights[j, a, b] * influence[j, i]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _curvature(rows, residuals, weights):
+    """J' W J (p, 3, 3) and J' W r (p, 3) of each point's rows J (p, k, 3), residuals r (p, k) and weight (p,)."""
+    curvature, forces = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+    for j in range(len(rows)):
+        for k in range(rows.shape[1]):
+            for a in range(3):
+                slope = weights[j] * rows[j, k, a]
+                forces[j, a] += slope * residuals[j, k]
+                for b in range(3):
+                    curvature[j, a, b] += slope * rows[j, k, b]
+    return curvature, forces
+
+
+@njit(cache=True, nogil=True)
+def _seen(positions, intrinsics, pixels, normals, weights, huber, point_px, outline_px):
+    """What `DiscrepancyFit.seen` returns, compiled."""
+    count = len(positions)
+    rows, residuals, counts = np.zeros((count, 2, 3)), np.zeros((count, 2)), np.zeros(count)
+    for j in range(count):
+        x, y, z = positions[j, 0], positions[j, 1], positions[j, 2]
+        right = intrinsics[0] * x / z + intrinsics[2] - pixels[j, 0]
+        down = intrinsics[1] * y / z + intrinsics[3] - pixels[j, 1]
+        if not (weights[j] > 0.0 and z > 0.0 and np.isfinite(right + down)):
+            continue
+        across, along = (intrinsics[0] / z, -intrinsics[0] * x / z**2), (intrinsics[1] / z, -intrinsics[1] * y / z**2)
+        n0, n1 = normals[j, 0], normals[j, 1]
+        if n0 != 0.0 or n1 != 0.0:
+            rows[j, 0, 0], rows[j, 0, 1], rows[j, 0, 2] = n0 * across[0], n1 * along[0], n0 * across[1] + n1 * along[1]
+            residuals[j, 0] = n0 * right + n1 * down
+            # The outline has a deviation of its own here, whatever the estimate counts it by.
+            weight = 1.0 / outline_px**2
+        else:
+            rows[j, 0, 0], rows[j, 0, 2], rows[j, 1, 1], rows[j, 1, 2] = across[0], across[1], along[0], along[1]
+            residuals[j, 0], residuals[j, 1] = right, down
+            weight = weights[j] / point_px**2
+        length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
+        counts[j] = weight * min(1.0, huber / max(length, 1e-12))
+    return rows, residuals, counts
+
+
+@njit(cache=True, nogil=True)
+def _strains(shape, rotation, lines, lengths, beyond, share):
+    """Curvature (e, 3, 3) and forces (e, 3) by what lines (e, 2) between samples (s, 3) have beyond the model's.
+
+    Parameters
+    ----------
+    shape : (s, 3) samples in the model's state, camera frame.
+    rotation : (3, 3) of that state's pose.
+    lengths : (e,) of the lines in the undeformed object.
+    beyond : (e, 3) by which the discrepancy's displacements of their ends differ.
+    share : the weight of a squared strain.
+    """
+    curvature, forces = np.empty((len(lines), 3, 3)), np.empty((len(lines), 3))
+    line = np.empty(3)
+    for e in range(len(lines)):
+        first, second = shape[lines[e, 0]], shape[lines[e, 1]]
+        before = np.sqrt((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2 + (first[2] - second[2]) ** 2)
+        for a in range(3):
+            line[a] = beyond[e, a]
+            for k in range(3):
+                line[a] += (first[k] - second[k]) * rotation[k, a]
+        now = np.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
+        strain = (now - before) / lengths[e]
+        for a in range(3):
+            slope = share * line[a] / (now * lengths[e])
+            forces[e, a] = slope * strain
+            for b in range(3):
+                curvature[e, a, b] = slope * line[b] / (now * lengths[e])
+    return curvature, forces
 
 
 class DiscrepancyFit:
@@ -136,15 +236,16 @@ class DiscrepancyFit:
         self._lines = _neighbour_lines(self._samples.rest, options.neighbours)
         start, end = self._samples.rest[self._lines.T]
         self._lengths = np.linalg.norm(start - end, axis=1)
-        self._influence = self.basis.influence(self._samples.rest)
-        self._stretching = self._influence[self._lines[:, 0]] - self._influence[self._lines[:, 1]]
+        influence = self.basis.influence_on(self._samples.rest)
+        self._stretching = influence[self._lines[:, 0]] - influence[self._lines[:, 1]]
+        self._known: tuple[Array, Array] | None = None
 
     def fit(self, measured: Observations, state: State, last: Discrepancy | None = None) -> Discrepancy:
         """The discrepancy of the frame that was measured, with the model in the estimated state.
 
         ``last`` is that of the frame before, to start from; None where it is not known.
         """
-        influence = self.basis.influence(measured.points.rest)
+        influence = self._influence_on(measured.points.rest)
         values = np.zeros((len(self.basis.centres), 3)) if last is None else last.values
         positions, shape = measured.points.in_camera(state), self._samples.in_camera(state)
         rotation = state.camera_from_object.rotation
@@ -155,6 +256,18 @@ class DiscrepancyFit:
             values = values + (self.prior(shape, rotation, values) + data).minimum()
         return Discrepancy(self.basis, values)
 
+    def _influence_on(self, rest: Array) -> Array:
+        """The centres' influence (p, m) on points (p, 3), most of which are where they were in the last call."""
+        if self._known is None or len(self._known[0]) != len(rest):
+            self._known = rest, self.basis.influence_on(rest)
+        else:
+            last, influence = self._known
+            moved = (rest != last).any(axis=1)
+            influence = influence.copy()
+            influence[moved] = self.basis.influence_on(rest[moved])
+            self._known = rest, influence
+        return self._known[1]
+
     def seen(self, measured: Observations, positions: Array) -> tuple[Array, Array, Array]:
         """Residuals at positions (p, 3) in the camera frame, with their derivatives and weights.
 
@@ -164,21 +277,11 @@ class DiscrepancyFit:
         residuals : (p, 2) pixels
         weights : (p,) inverse variances with Huber's factor.
         """
-        options, normals = self.options, measured.normals
-        derivatives = self.camera.projection_jacobian(positions)
-        residuals = self.camera.project(positions) - measured.pixels
-        across = (normals != 0.0).any(axis=1)
-        derivatives[across, 0] = np.einsum("pk,pka->pa", normals[across], derivatives[across])
-        residuals[across, 0] = np.einsum("pk,pk->p", normals[across], residuals[across])
-        derivatives[across, 1] = residuals[across, 1] = 0.0
-        used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
-        derivatives[~used] = residuals[~used] = 0.0
-        length = np.linalg.norm(residuals, axis=1)
-        huber = np.minimum(1.0, options.huber_px / np.maximum(length, 1e-12))
-        sigma = np.where(across, options.outline_px, options.point_px)
-        # The outline has a deviation of its own here, whatever the estimate counts it by.
-        counts = np.where(across, 1.0, measured.weights)
-        return derivatives, residuals, np.where(used, counts * huber / sigma**2, 0.0)
+        options = self.options
+        return _seen(
+            positions, self.camera.intrinsics, measured.pixels, measured.normals, measured.weights,
+            options.huber_px, options.point_px, options.outline_px,
+        )  # fmt: skip
 
     def shape(self, state: State) -> Array:
         """The samples (s, 3) of the surface in the camera frame, in a state of the model, metres."""
@@ -193,15 +296,10 @@ class DiscrepancyFit:
         rotation : (3, 3) of that state's pose.
         """
         process = _Quadratic(self._precision, self._precision @ values.T.ravel())
-        start, end = self._lines.T
-        model = (shape[start] - shape[end]) @ rotation
-        now = model + self._stretching @ values
-        length = np.linalg.norm(now, axis=1)
-        strain = (length - np.linalg.norm(model, axis=1)) / self._lengths
-        gradient = now / (length * self._lengths)[:, None]
-        share = STRAINS_A_SAMPLE * len(shape) / len(strain) / self.options.strain**2
-        outer = share * gradient[:, :, None] * gradient[:, None, :]
-        return process + _Quadratic.of_rows(outer, share * strain[:, None] * gradient, self._stretching)
+        share = STRAINS_A_SAMPLE * len(shape) / len(self._lines) / self.options.strain**2
+        beyond = self._stretching @ values
+        terms = _strains(shape, rotation, self._lines, self._lengths, beyond, share)
+        return process + _Quadratic.of_rows(*terms, self._stretching)
 
 
 def _neighbour_lines(points: Array, count: int) -> NDArray[np.int64]:

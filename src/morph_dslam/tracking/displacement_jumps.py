@@ -92,9 +92,9 @@ class JumpDetector:
         apart = np.linalg.norm(self._places[:, None] - self._places, axis=2)
         self._near = (apart < self._reach).astype(np.float64)
         self._samples = _spread(rest, SAMPLES)
-        self._shapes = np.empty((0, len(self._samples), 3))
-        self._steps: list[Array] = []
-        self._largest = 0.0
+        self._shapes = np.empty((KEPT + 1, len(self._samples), 3))
+        self._steps = np.empty((KEPT + 1, len(self._places), DIRECTIONS, 2))
+        self._count, self._largest = 0, 0.0
         self._in_turn = np.zeros(len(self._places), dtype=int)
         self._sizes = np.zeros(len(self._places))
 
@@ -116,10 +116,10 @@ class JumpDetector:
         """
         if not len(self._places):
             return
-        shape = displacement[self._samples]
-        apart = self._shapes - shape
+        shape, count = displacement[self._samples], self._count
+        apart = self._shapes[:count] - shape
         away = np.sqrt(np.einsum("fsk,fsk->fs", apart, apart)).mean(axis=1)
-        if len(away):
+        if count:
             self._largest = max(self._largest, float(away[0]))
             if away[-1] <= AGAIN * self._largest:
                 return
@@ -128,31 +128,23 @@ class JumpDetector:
         steps, deviations = _fit_steps(self._rows, self._first, self._plane, values, usable, DIRECTIONS, LEAST_POINTS)
         steps, deviations = px * steps, px * deviations
         like = self._like(away)
-        least = max(self._limit, LEAST_PX * px)
-        if len(like) >= LEAST_LIKE and np.sqrt(2.0) * (_largest(steps) + _largest(like)) < least:
-            self._in_turn[:] = 0  # no difference of these is large enough
-        elif len(like) >= LEAST_LIKE:
-            before = np.median(like, axis=0)
-            # The deviation of a median is 1.25 times that of a mean, and the median distance 1.18 deviations.
-            spread = 1.25 / 1.18 * np.median(np.linalg.norm(like - before, axis=3), axis=0) / np.sqrt(len(like))
-            self._compare(np.linalg.norm(steps - before, axis=2), np.hypot(deviations, spread), least)
-        self._shapes = np.concatenate([self._shapes, shape[None]])
-        self._steps.append(steps)
-        if len(self._steps) > KEPT:  # the first shape stays: it is what displacements are measured from
-            self._shapes = np.delete(self._shapes, np.s_[1::2], axis=0)
-            del self._steps[1::2]
+        if len(like) >= LEAST_LIKE:
+            least = max(self._limit, LEAST_PX * px)
+            self._note(_grown_steps(self._steps, like, steps, deviations, 0.5 * least), least)
+        self._shapes[count], self._steps[count] = shape, steps
+        self._count += 1
+        if self._count > KEPT:  # the first shape stays: it is what displacements are measured from
+            kept = np.arange(0, self._count, 2)
+            self._count = len(kept)
+            self._shapes[: self._count], self._steps[: self._count] = self._shapes[kept], self._steps[kept]
 
-    def _like(self, away: Array) -> Array:
-        """The steps (f, k, d, 2) in earlier frames with nearly this shape, by how far ``away`` (h,) theirs are."""
+    def _like(self, away: Array) -> NDArray[np.int64]:
+        """Which earlier frames (f,) have nearly this shape, by how far ``away`` (h,) theirs are."""
         rows = np.flatnonzero((away > LIKE[0] * self._largest) & (away < LIKE[1] * self._largest))
-        chosen = np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).astype(int))
-        return np.array([self._steps[k] for k in rows[chosen]])
+        return rows[np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).astype(int))]
 
-    def _compare(self, change: Array, deviations: Array, least: float) -> None:
-        """Note the places at which steps have changed (k, d) by ``least``, and by more than steps of these deviations
-        do."""
-        with np.errstate(invalid="ignore"):
-            sizes = np.where(change > LEAST_DEVIATIONS * deviations, change, 0.0).max(axis=1)
+    def _note(self, sizes: Array, least: float) -> None:
+        """Note the places at which steps have grown (k,) by ``least``."""
         # A line has several places along it, at which the step is about as large.
         jumps = np.where((sizes > least) & (self._near @ (sizes > 0.5 * least) > 1), sizes, 0.0)
         self._in_turn = np.where(self._near @ (jumps > 0.0) > 0, self._in_turn + 1, 0)
@@ -160,9 +152,36 @@ class JumpDetector:
         self._sizes[found] = np.maximum(self._sizes[found], jumps[found])
 
 
-def _largest(numbers: Array) -> float:
-    """The largest absolute value; what is not a number does not count."""
-    return float(np.fmax.reduce(np.abs(numbers), axis=None, initial=0.0))
+@njit(cache=True, nogil=True)
+def _grown_steps(before, rows, steps, deviations, least):
+    """How far each place's step (k,), in the direction in which that is farthest, is from what it was before.
+
+    What is less than ``least``, or `LEAST_DEVIATIONS` of the difference, is zero.
+
+    Parameters
+    ----------
+    before : (h, k, d, 2) steps in earlier frames, metres.
+    rows : (f,) those to compare with, by their median.
+    steps, deviations : (k, d, 2) and (k, d) now; NaN where there are too few points.
+    """
+    sizes, u, v, count = np.zeros(len(steps)), np.empty(len(rows)), np.empty(len(rows)), len(rows)
+    for k in range(steps.shape[0]):
+        for d in range(steps.shape[1]):
+            right, down = 0.0, 0.0
+            for f in range(count):
+                u[f], v[f] = steps[k, d, 0] - before[rows[f], k, d, 0], steps[k, d, 1] - before[rows[f], k, d, 1]
+                right, down = max(right, abs(u[f])), max(down, abs(v[f]))
+            # A median is no larger than the largest, so that hardly any is needed.
+            if not right**2 + down**2 > max(least, sizes[k]) ** 2 or np.isnan(np.sum(u)):
+                continue
+            middle_u, middle_v = np.median(u), np.median(v)
+            change = np.sqrt(middle_u**2 + middle_v**2)
+            # The deviation of a median is 1.25 times that of a mean, and the median distance 1.18 deviations.
+            spread = np.median(np.sqrt((u - middle_u) ** 2 + (v - middle_v) ** 2)) * 1.25 / 1.18 / np.sqrt(count)
+            clear = change > LEAST_DEVIATIONS * np.sqrt(deviations[k, d] ** 2 + spread**2)
+            if clear and change > max(least, sizes[k]):
+                sizes[k] = change
+    return sizes
 
 
 def _spread(points: Array, most: int) -> NDArray[np.int64]:

@@ -22,7 +22,8 @@ from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, huber_covariance
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
 from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
-from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.noise import Correlation, Observations, quadratic
+from morph_dslam.tracking.patches import FAST
 from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
 
 #: Points nearer to the camera plane than this, in metres, or behind it cannot be seen.
@@ -78,25 +79,26 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
     flat_modes = modes.reshape(modes.shape[0], 3 * n_points)
     fields = combine_modes(functions, flat_modes).reshape(1 + d, n_points, 3)
     size = d + 6
-    hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    residuals, jacobian, turned = np.empty((n_points, 2)), np.zeros((2, size)), np.empty(3)
-    cost = 0.0
+    residuals, turned, slopes = np.empty((n_points, 2)), np.empty((3, n_points)), np.zeros((2, 3, n_points))
+    # By rows: the derivatives by each unknown and the residuals, all times the root of the weight; of all points one
+    # coordinate after the other. Long rows are what the compiler vectorizes.
+    rows, cost = np.zeros((size + 1, 2 * n_points)), 0.0
     for j in range(n_points):
         p0, p1, p2 = rest[j, 0] + fields[0, j, 0], rest[j, 1] + fields[0, j, 1], rest[j, 2] + fields[0, j, 2]
         for c in range(3):
-            turned[c] = rotation[c, 0] * p0 + rotation[c, 1] * p1 + rotation[c, 2] * p2
-        depth = turned[2] + translation[2]
+            turned[c, j] = rotation[c, 0] * p0 + rotation[c, 1] * p1 + rotation[c, 2] * p2
+        depth = turned[2, j] + translation[2]
         if depth < MINIMUM_DEPTH:
             residuals[j] = np.nan
             cost += UNSEEN_COST * weights[j]
             continue
-        x, y = (turned[0] + translation[0]) / depth, (turned[1] + translation[1]) / depth
+        x, y = (turned[0, j] + translation[0]) / depth, (turned[1, j] + translation[1]) / depth
         residuals[j, 0] = intrinsics[0] * x + intrinsics[2] - pixels[j, 0]
         residuals[j, 1] = intrinsics[1] * y + intrinsics[3] - pixels[j, 1]
         n0, n1 = normals[j, 0], normals[j, 1]
         directed = n0 != 0.0 or n1 != 0.0
+        along = n0 * residuals[j, 0] + n1 * residuals[j, 1]
         if directed:
-            along = n0 * residuals[j, 0] + n1 * residuals[j, 1]
             residuals[j, 0], residuals[j, 1] = n0 * along, n1 * along
         if weights[j] == 0.0:
             continue
@@ -107,19 +109,65 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
         else:
             cost += weight * huber * (length - 0.5 * huber)
             weight *= huber / length
-        _point_jacobian(jacobian, fields, j, rotation, turned, 1.0 / depth, x, y, intrinsics)
+        root = np.sqrt(weight)
+        ax, ay = root * intrinsics[0] / depth, root * intrinsics[1] / depth
         if directed:
-            for a in range(size):
-                slope = n0 * jacobian[0, a] + n1 * jacobian[1, a]
-                jacobian[0, a], jacobian[1, a] = n0 * slope, n1 * slope
-        across, down = jacobian[0], jacobian[1]
-        for a in range(size):
-            first, second, row = weight * across[a], weight * down[a], hessian[a]
-            gradient[a] += first * residuals[j, 0] + second * residuals[j, 1]
-            # Whole rows are what the compiler vectorizes: less than the time of half of each.
-            for b in range(size):
-                row[b] += first * across[b] + second * down[b]
+            slopes[0, 0, j], slopes[0, 1, j], slopes[0, 2, j] = n0 * ax, n1 * ay, -n0 * ax * x - n1 * ay * y
+            rows[size, j] = root * along
+        else:
+            slopes[0, 0, j], slopes[0, 2, j] = ax, -ax * x
+            slopes[1, 1, j], slopes[1, 2, j] = ay, -ay * y
+            rows[size, j], rows[size, n_points + j] = root * residuals[j, 0], root * residuals[j, 1]
+    _fill_derivatives(rows, fields, slopes, turned, rotation)
+    hessian, gradient = np.empty((size, size)), np.empty(size)
+    for a in range(size):
+        gradient[a] = sum_of_products(rows[a], rows[size])
+        for b in range(a + 1):
+            hessian[a, b] = hessian[b, a] = sum_of_products(rows[a], rows[b])
     return cost, hessian, gradient, residuals
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def sum_of_products(a, b):
+    """Sum of the products of two rows of numbers, in any order."""
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _fill_derivatives(rows, fields, slopes, turned, rotation):
+    """Fill the rows (d + 6, 2 p) of `linearise`.
+
+    Parameters
+    ----------
+    fields : (1 + d, p, 3) displacements and their derivatives by the parameters.
+    slopes : (2, 3, p) of what counts of each pixel by the point's place in the camera frame.
+    turned : (3, p) points in the camera's axes about the object's origin.
+    rotation : (3, 3) of camera_from_object.
+    """
+    d, n_points = fields.shape[0] - 1, turned.shape[1]
+    for which in range(2):
+        begin, end = which * n_points, (which + 1) * n_points
+        u, v, w = slopes[which, 0], slopes[which, 1], slopes[which, 2]
+        for k in range(d):
+            line, field = rows[k, begin:end], fields[k + 1]
+            for j in range(n_points):
+                s0, s1, s2 = field[j, 0], field[j, 1], field[j, 2]
+                line[j] = (
+                    u[j] * (rotation[0, 0] * s0 + rotation[0, 1] * s1 + rotation[0, 2] * s2)
+                    + v[j] * (rotation[1, 0] * s0 + rotation[1, 1] * s1 + rotation[1, 2] * s2)
+                    + w[j] * (rotation[2, 0] * s0 + rotation[2, 1] * s1 + rotation[2, 2] * s2)
+                )
+        tx, ty, tz = turned[0], turned[1], turned[2]
+        about_x, about_y, about_z = rows[d, begin:end], rows[d + 1, begin:end], rows[d + 2, begin:end]
+        right, down, ahead = rows[d + 3, begin:end], rows[d + 4, begin:end], rows[d + 5, begin:end]
+        for j in range(n_points):
+            about_x[j] = w[j] * ty[j] - v[j] * tz[j]
+            about_y[j] = u[j] * tz[j] - w[j] * tx[j]
+            about_z[j] = v[j] * tx[j] - u[j] * ty[j]
+            right[j], down[j], ahead[j] = u[j], v[j], w[j]
 
 
 @njit(cache=True, nogil=True)
@@ -147,6 +195,42 @@ def project_with_jacobian(functions, rotation, translation, rest, modes, intrins
     return pixels, jacobian
 
 
+@njit(cache=True, nogil=True)
+def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsics, residuals, weights, normals, huber):
+    """Jacobian (p, 2, d + 6) by which an error of a pixel enters the gradient, and the Hessian (d + 6, d + 6).
+
+    The first is Huber's factor times the root of the weight times the pixel's Jacobian, along its normal where it has
+    one; zero where a point does not count.
+
+    Parameters
+    ----------
+    functions, rotation, translation, rest, modes, intrinsics, weights, normals, huber : as of `linearise`.
+    residuals : (p, 2) of the estimate, pixels.
+    """
+    _, jacobian = project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics)
+    size = jacobian.shape[2]
+    hessian = np.zeros((size, size))
+    for j in range(len(rest)):
+        across, down = jacobian[j, 0], jacobian[j, 1]
+        length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
+        if not (weights[j] > 0.0 and np.isfinite(length)):
+            across[:], down[:] = 0.0, 0.0
+            continue
+        n0, n1 = normals[j, 0], normals[j, 1]
+        if n0 != 0.0 or n1 != 0.0:
+            for a in range(size):
+                slope = n0 * across[a] + n1 * down[a]
+                across[a], down[a] = n0 * slope, n1 * slope
+        factor, root = min(1.0, huber / max(length, 1e-300)), np.sqrt(weights[j])
+        for a in range(size):
+            first, second, row = factor * weights[j] * across[a], factor * weights[j] * down[a], hessian[a]
+            for b in range(size):
+                row[b] += first * across[b] + second * down[b]
+        for a in range(size):
+            across[a], down[a] = factor * root * across[a], factor * root * down[a]
+    return jacobian, hessian
+
+
 Array = NDArray[np.float64]
 
 
@@ -161,12 +245,14 @@ class LinearCost:
     of_depths : (n, n), covariance of the gradient from errors of depths, and of what is known of unknown loads
     hessian : (n, n).
     scale : (n,) of the unknowns.
+    correlation : (p, p) of the points' errors.
     """
 
     weighted_jacobian: Array
     of_depths: Array
     hessian: Array
     scale: Array
+    correlation: Correlation
 
     @classmethod
     def about(
@@ -174,30 +260,20 @@ class LinearCost:
     ) -> LinearCost:
         """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
         points, pose = measured.points, state.camera_from_object
-        _, jacobian = project_with_jacobian(
+        weighted_jacobian, hessian = weighted_derivatives(
             points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, camera.intrinsics,
+            points.field.modes, camera.intrinsics, residuals, measured.weights, measured.normals, huber_px,
         )  # fmt: skip
-        directed = (measured.normals != 0.0).any(axis=1)
-        normals = measured.normals[directed]
-        jacobian[directed] = (normals[:, :, None] * normals[:, None, :]) @ jacobian[directed]
-        length = np.linalg.norm(residuals, axis=1)
-        used = (measured.weights > 0.0) & np.isfinite(length)
-        jacobian[~used] = 0.0
-        factor = np.minimum(1.0, huber_px / np.maximum(np.where(used, length, 0.0), 1e-300))
-        exactness = np.sqrt(measured.weights)[:, None, None]
-        weighted_jacobian = exactness * factor[:, None, None] * jacobian
-        hessian = np.tensordot(weighted_jacobian, exactness * jacobian, axes=([0, 1], [0, 1]))
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)
             hessian, of_depths = hessian + part, measured.depths.variance_px(far) * part
-        return cls(weighted_jacobian, of_depths, hessian, scale)
+        return cls(weighted_jacobian, of_depths, hessian, scale, measured.correlation)
 
     def in_unknowns(self, chain: Array) -> LinearCost:
         """The same cost of other unknowns, whose increments ``chain`` (n, m) turns into these."""
         hessian, of_depths = (chain.T @ matrix @ chain for matrix in (self.hessian, self.of_depths))
-        return LinearCost(self.weighted_jacobian @ chain, of_depths, hessian, self.scale)
+        return LinearCost(self.weighted_jacobian @ chain, of_depths, hessian, self.scale, self.correlation)
 
     def holding(self, indices: NDArray[np.int64]) -> LinearCost:
         """The same cost with the unknowns at ``indices`` (k,) known: how well the others are then."""
@@ -207,17 +283,23 @@ class LinearCost:
         for matrix in (of_depths, hessian):
             matrix[indices], matrix[:, indices] = 0.0, 0.0
         hessian[indices, indices] = max(largest, 1e-30) / self.scale[indices] ** 2
-        return LinearCost(rows, of_depths, hessian, self.scale)
+        return LinearCost(rows, of_depths, hessian, self.scale, self.correlation)
 
     @staticmethod
-    def joined(costs: Sequence[LinearCost]) -> LinearCost:
-        """The sum of costs of the same unknowns, their points one after the other."""
+    def joined(costs: Sequence[LinearCost], correlation: Correlation) -> LinearCost:
+        """The sum of costs of the same unknowns, their points, with errors of this correlation, one after the other."""
         return LinearCost(
             np.concatenate([cost.weighted_jacobian for cost in costs]),
             np.sum([cost.of_depths for cost in costs], axis=0),
             np.sum([cost.hessian for cost in costs], axis=0),
             costs[0].scale,
+            correlation,
         )
+
+    @cached_property
+    def spread(self) -> Array:
+        """The gradient's covariance (n, n) from errors of the points, of variance one at weight one."""
+        return quadratic(self.weighted_jacobian, self.correlation)
 
     @cached_property
     def _spectrum(self) -> tuple[Array, Array, float]:
@@ -378,18 +460,34 @@ class Estimator:
         depths : of the p points, where a depth camera saw them.
         """
         normals = np.zeros_like(pixels) if normals is None else normals
-
-        def evaluate(state: State) -> tuple[float, Array, Array, Array]:
-            return self.evaluate(points, pixels, weights, state, normals, prior, depths)
-
-        found = minimise(evaluate, start, self.box, self.options.max_iterations, self.options.tolerance)
+        found = self.minimum(points, pixels, weights, start, normals, prior, depths)
         # A point on an outline gives one number, all others give two.
-        numbers = np.where((normals != 0.0).any(axis=1), 1, 2)
-        return self.finished(found, weights, numbers)
+        return self.finished(found, weights, 2 - (normals != 0.0).any(axis=1))
+
+    def minimum(
+        self,
+        points: BoundPoints,
+        pixels: Array,
+        weights: Array,
+        start: State,
+        normals: Array | None = None,
+        prior: Prior | None = None,
+        depths: PointDepths | None = None,
+    ) -> Minimum:
+        """The minimum that `estimate` finds, where nobody asks how exact it is."""
+        normals = np.zeros_like(pixels) if normals is None else normals
+        return minimise(
+            lambda state: self.evaluate(points, pixels, weights, state, normals, prior, depths),
+            start, self.box, self.options.max_iterations, self.options.tolerance,
+        )  # fmt: skip
 
     def fit(self, measured: Observations, start: State, prior: Prior | None = None) -> Estimate:
         """`estimate` from all that was measured in a frame."""
-        return self.estimate(
+        return self.finished(self.fitted(measured, start, prior), measured.weights, measured.numbers)
+
+    def fitted(self, measured: Observations, start: State, prior: Prior | None = None) -> Minimum:
+        """`minimum` of all that was measured in a frame."""
+        return self.minimum(
             measured.points, measured.pixels, measured.weights, start, measured.normals, prior, measured.depths
         )
 

@@ -14,17 +14,26 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.timing import stage
+from morph_dslam.tracking.covariance import trace_of_share
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
-from morph_dslam.tracking.noise import Observations, PointNoise, RigObservations, block_diagonal, window_correlation
+from morph_dslam.tracking.noise import (
+    Correlation,
+    Observations,
+    PointNoise,
+    RigObservations,
+    block_diagonal,
+    window_correlation,
+)
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
+from morph_dslam.tracking.state import BoundPoints
 from morph_dslam.tracking.systematic_errors import Unexplained
 
 Array = NDArray[np.float64]
@@ -33,6 +42,8 @@ Array = NDArray[np.float64]
 REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
 #: Share of the cost below which another shape is a better explanation and not the same one.
 CLEARLY_BETTER = 0.95
+#: Other shapes are tried on at least so many points, where there are as many, and at most twice as many.
+SCOUTED = 80
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
 LEAST_SIGMA_PX = 0.1
 #: A start off a bound is this share of the range inside of it.
@@ -98,6 +109,16 @@ def with_unobservable_at_default(model: ReducedModel, estimate: Estimate) -> Sta
     return replace(state, parameters=np.where(_unobservable(model, estimate), model.default, state.parameters))
 
 
+def a_turn_back(model: ReducedModel, start: State, estimate: Estimate, angles: Sequence[str]) -> State:
+    """A start with ``angles`` about an axis of revolution, by name, that ended at a bound the same a turn back.
+
+    Their range is of two turns: from its middle they may go on either way.
+    """
+    ended = estimate.at_bound & [parameter.name in angles for parameter in model.parameters]
+    turns = 2.0 * np.pi * np.sign(start.parameters)
+    return replace(start, parameters=np.where(ended, start.parameters - turns, start.parameters))
+
+
 def _unobservable(model: ReducedModel, estimate: Estimate) -> NDArray[np.bool_]:
     """Which parameters (d,) the images did not determine."""
     return ~(estimate.parameter_std < UNOBSERVABLE_SHARE * (model.upper - model.lower))
@@ -113,11 +134,12 @@ class FrameEstimation:
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
         self._scout.loads = estimator.loads
+        self._last_joined: tuple[BoundPoints, BoundPoints] | None = None
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""
         weights = followed.valid.astype(float)
-        return self._scout.estimate(self._reference.points, followed.pixels, weights, start, prior=prior).state
+        return self._scout.minimum(self._reference.points, followed.pixels, weights, start, prior=prior).state
 
     def correct(self, picture: Image, state: State, offsets: Array | None, prior: Prior | None) -> PoseHypothesis:
         """Measure against the reference view rendered in ``state`` and estimate from these measurements.
@@ -152,8 +174,11 @@ class FrameEstimation:
     def learn(self, attempt: PoseHypothesis, picture: Image) -> None:
         """Take in how well the points agreed in a frame that is believed."""
         if attempt.outline_alone and attempt.outline is not None:
-            taken = self._taken(attempt, attempt.outline, attempt.estimate)
-            self._balance.learn_outline(attempt.outline, attempt.estimate.residuals, taken)
+            seen, state = attempt.outline, attempt.estimate.state
+            whole = self._estimator.evaluate(
+                seen.points, seen.pixels, seen.weights, state, seen.normals, attempt.prior
+            )[1]
+            self._balance.learn_outline(seen, attempt.estimate.residuals, self._taken(seen, state, whole))
             if picture.has_grey and self._reference.outline is not None:
                 self._reference.outline.take_brightness(picture.grey, attempt.estimate.state)
             return
@@ -172,18 +197,27 @@ class FrameEstimation:
         if attempt.outline_alone or not attempt.estimate.sigma_px < np.inf:
             return attempt
         starts = self._search.starts(attempt.estimate, attempt.estimate.sigma_px > self._options.search_above_px)
-        return self.best_of(attempt, starts) if starts else attempt
+        return self.best_of(attempt, starts)
 
     def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
-        measurement, estimate, prior = attempt.measurement, attempt.estimate, attempt.prior
-        points, weights = self._reference.points, self._noise.weights(measurement.spread, measurement.valid)
-        cost = self._estimator.evaluate(points, measurement.pixels, weights, estimate.state, prior=prior)[0]
-        found = [self._scout.estimate(points, measurement.pixels, weights, start, prior=prior) for start in starts]
-        best = min(found, key=lambda other: other.cost, default=estimate)
-        if best.cost > CLEARLY_BETTER * cost:
-            return attempt
+        measurement, prior, state = attempt.measurement, attempt.prior, attempt.estimate.state
+        weights, valid = self._noise.weights(measurement.spread, measurement.valid), np.flatnonzero(measurement.valid)
+        every = (self._reference.points, measurement.pixels, weights)
+        rows = valid[:: 1 + len(valid) // SCOUTED]
+        # So many times the weight, lest a prior count for more among few.
+        few = (every[0].take(rows), every[1][rows], weights[rows] * (len(valid) / max(len(rows), 1)))
+        found = [self._scout.minimum(*few, start, prior=prior) for start in starts]
+        best = min(found, key=lambda other: other.cost, default=None)
+        for points in (few, every):
+            if best is None or self._cost(points, best.state, prior) > CLEARLY_BETTER * self._cost(
+                points, state, prior
+            ):
+                return attempt
         return self._trimmed(measurement, best.state, prior)
+
+    def _cost(self, measured: tuple[BoundPoints, Array, Array], state: State, prior: Prior | None) -> float:
+        return self._estimator.evaluate(*measured, state, prior=prior)[0]
 
     def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate from the supporting points and the outline together; searched far first, then near."""
@@ -201,14 +235,18 @@ class FrameEstimation:
             offsets = self._estimator.camera.project(seen.points.in_camera(estimate.state)) - seen.pixels
             balance.learn_outline(seen, offsets, 0.0)
         # After the first search the state only says where to look the second time: it need not be exact.
-        estimate = self._with_outline(self._scout, attempt, seen.weighted(balance.weight), estimate.state)
-        seen = outline.measure_again(picture.grey, estimate.state, REACH_PX // 2, occluders)
-        seen = self._uncovered(seen, attempt, estimate.state).weighted(balance.weight)
-        estimate = self._with_outline(self._estimator, attempt, seen, estimate.state)
-        agreeing = seen.weighted(balance.weight, balance.agreeing(estimate.residuals[-len(seen.weights) :]))
-        balance.learn_outline(seen, estimate.residuals[-len(seen.weights) :], self._taken(attempt, seen, estimate))
+        wide = self._with_outline(attempt, seen.weighted(balance.weight))
+        state = self._scout.fitted(wide, estimate.state, attempt.prior).state
+        seen = outline.measure_again(picture.grey, state, REACH_PX // 2, occluders)
+        seen = self._uncovered(seen, attempt, state).weighted(balance.weight)
+        together = self._with_outline(attempt, seen)
+        found = self._estimator.fitted(together, state, attempt.prior)
+        estimate = self._estimator.finished(found, together.weights, together.numbers)
+        of_outline = estimate.residuals[-len(seen.weights) :]
+        agreeing = seen.weighted(balance.weight, balance.agreeing(of_outline))
+        balance.learn_outline(seen, of_outline, self._taken(seen, found.state, found.hessian))
         balance.learn_texture(*self._supporting(attempt, estimate))
-        estimate = self._with_outline(self._estimator, attempt, agreeing, estimate.state)
+        estimate = self._estimator.fit(self._with_outline(attempt, agreeing), found.state, attempt.prior)
         return replace(attempt, estimate=estimate, outline=agreeing)
 
     def _uncovered(self, seen: OutlineMeasurement, attempt: PoseHypothesis, state: State) -> OutlineMeasurement:
@@ -263,27 +301,17 @@ class FrameEstimation:
         rows = attempt.inliers
         return attempt.measurement.pixels[rows], estimate.residuals[: len(rows)][rows], estimate.sigma_px
 
-    def _with_outline(
-        self, estimator: Estimator, attempt: PoseHypothesis, seen: OutlineMeasurement, start: State
-    ) -> Estimate:
-        """The estimate from the supporting points and the outline together."""
-        together = self.measured(replace(attempt, outline=seen, depths=None), correlated=False)
-        return estimator.fit(together, start, attempt.prior)
+    def _with_outline(self, attempt: PoseHypothesis, seen: OutlineMeasurement) -> Observations:
+        """The supporting points and the outline together."""
+        return self.measured(replace(attempt, outline=seen, depths=None), correlated=False)
 
-    def _taken(self, attempt: PoseHypothesis, seen: OutlineMeasurement, estimate: Estimate) -> float:
-        """How many of the outline's numbers an estimate with them takes up: the trace of H^-1 H_outline."""
-        together = self.measured(replace(attempt, outline=seen, depths=None), correlated=False)
-        own = replace(
-            together, weights=np.where(np.arange(len(together.weights)) < len(attempt.inliers), 0.0, together.weights)
-        )
-        whole, part = (
-            self._estimator.evaluate(
-                m.points, m.pixels, m.weights, estimate.state, m.normals, attempt.prior if m is together else None
-            )[1]
-            for m in (together, own)
-        )
-        scale = np.outer(self._estimator.scale, self._estimator.scale)
-        return float(np.trace(np.linalg.pinv(whole * scale, 1e-12, True) @ (part * scale)))
+    def _taken(self, seen: OutlineMeasurement, state: State, hessian: Array) -> float:
+        """How many of the outline's numbers an estimate takes up: the trace of H^-1 H_outline.
+
+        ``hessian`` (d + 6, d + 6) is that of all that the estimate was made from, H.
+        """
+        part = self._estimator.evaluate(seen.points, seen.pixels, seen.weights, state, seen.normals)[1]
+        return trace_of_share(hessian, part, self._estimator.scale)
 
     def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate with the depths of the supporting points too, if a depth camera saw them."""
@@ -309,14 +337,21 @@ class FrameEstimation:
         """
         points, pixels, weights = self._reference.points, attempt.measurement.pixels, attempt.weights
         normals, seen = np.zeros_like(pixels), attempt.outline
-        correlation = window_correlation(pixels if correlated else pixels[:0], PATCH_WINDOW)
+        correlation: Correlation = np.zeros((0, 0))
+        if correlated:
+            alike = window_correlation(pixels, PATCH_WINDOW)
+            correlation = alike if seen is None else block_diagonal([alike, self._balance.correlation(seen)])
         if seen is not None:
-            points = points.joined(seen.points)
+            points = self._joined(seen.points)
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, seen.weights])
-            if correlated:
-                correlation = block_diagonal([correlation, self._balance.correlation(seen)])
         return Observations(points, pixels, weights, normals, correlation, attempt.depths)
+
+    def _joined(self, outline: BoundPoints) -> BoundPoints:
+        """The view's points followed by those of the outline, which mostly are those of the last call."""
+        if self._last_joined is None or self._last_joined[0] is not outline:
+            self._last_joined = outline, self._reference.points.joined(outline)
+        return self._last_joined[1]
 
 
 # What frames have to do with each other, by choice: parameters that are kept, that walk, and the start.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +42,11 @@ class Image:
     normalized: NDArray[np.uint8]
     depth: NDArray[np.float32] | None = None
     occluder_depth: NDArray[np.float32] | None = None
+
+    @cached_property
+    def half(self) -> NDArray[np.uint8]:
+        """The contrast-normalized image in half of its size."""
+        return cv2.pyrDown(self.normalized)  # type: ignore[return-value]
 
     @property
     def has_grey(self) -> bool:

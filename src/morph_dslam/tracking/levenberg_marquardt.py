@@ -12,8 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
-from morph_dslam.tracking.state import State, moved
+from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
 
@@ -92,7 +93,6 @@ class Box:
 
     def nearest(self, state: State) -> State:
         """The state with its parameters inside the box."""
-        # Several times as fast as np.clip on a few numbers, and called in every iteration.
         inside = np.minimum(np.maximum(state.parameters, self.lower), self.upper)
         return State(inside, state.camera_from_object)
 
@@ -111,23 +111,28 @@ class Minimum:
 
 def minimise(evaluate: Evaluate, start: State, box: Box, max_iterations: int = 25, tolerance: float = 1e-6) -> Minimum:
     """Minimise a cost from ``start``, until it would decrease by less than ``tolerance`` of itself."""
-    state = box.nearest(start)
+    known = start.camera_from_object
+    pose = RigidTransform(np.ascontiguousarray(known.rotation), np.ascontiguousarray(known.translation))
+    state, bounds = box.nearest(State(start.parameters, pose)), (box.lower, box.upper, box.scale)
     cost, hessian, gradient, residuals = evaluate(state)
     damping, iterations, converged = 1e-3, 0, False
     while iterations < max_iterations and not converged:
         iterations += 1
-        step, predicted = damped_step(hessian, gradient, state.parameters, box.lower, box.upper, box.scale, damping)
+        pose = state.camera_from_object
+        predicted, *trial = damped_trial(
+            hessian, gradient, state.parameters, pose.rotation, pose.translation, *bounds, damping
+        )
         if predicted <= tolerance * cost + 1e-14:
             # A damped step predicts little although much could be gained: believe it only undamped.
             converged = damping <= 1e-2
             damping = min(damping * 0.01, 1e-2)
             continue
-        # Rounding may leave a parameter an ulp outside its range.
-        trial = box.nearest(moved(state, step * box.scale))
-        attempt = evaluate(trial)
+        parameters, rotation, translation = trial
+        moved = State(parameters, RigidTransform(rotation, translation))
+        attempt = evaluate(moved)
         if attempt[0] < cost:
             ratio = (cost - attempt[0]) / predicted
-            state, (cost, hessian, gradient, residuals) = trial, attempt
+            state, (cost, hessian, gradient, residuals) = moved, attempt
             damping = max(damping * (0.1 if ratio > 0.5 else 1.0), 1e-9)
         else:
             damping *= 10.0
@@ -162,3 +167,24 @@ def damped_step(hessian, gradient, parameters, lowest, highest, scale, damping):
         upper[k] = min(upper[k], (highest[k] - parameters[k]) / scale[k])
     step = bounded_step(damped, slope, lower, upper)
     return step, -(slope @ step + 0.5 * step @ (scaled @ step))
+
+
+@njit(cache=True, nogil=True)
+def damped_trial(hessian, gradient, parameters, rotation, translation, lowest, highest, scale, damping):
+    """`damped_step`, and the state that it leads to, as `moved` makes it, in the box.
+
+    Parameters
+    ----------
+    hessian, gradient, parameters, lowest, highest, scale, damping : as of `damped_step`.
+    rotation, translation : (3, 3) and (3,) of camera_from_object.
+
+    Returns
+    -------
+    predicted : decrease of the cost.
+    parameters, rotation, translation : of the state, as above.
+    """
+    step, predicted = damped_step(hessian, gradient, parameters, lowest, highest, scale, damping)
+    step, d = step * scale, len(parameters)
+    # Rounding may leave a parameter an ulp outside its range.
+    there = np.minimum(np.maximum(parameters + step[:d], lowest), highest)
+    return predicted, there, rotation_exp(step[d : d + 3]) @ rotation, translation + step[d + 3 :]

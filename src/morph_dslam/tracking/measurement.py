@@ -14,9 +14,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.render.rasteriser import corner_weights, is_inside, pack_nodes, pixel_window, visible_points
-from morph_dslam.tracking.binding import Drawing, View, facing, signed_areas
+from morph_dslam.model import ReducedModel
+from morph_dslam.render.rasteriser import corner_weights, covered_steps, pack_nodes, pixel_window, visible_points
+from morph_dslam.tracking.binding import Drawing, View, signed_areas
 from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
 
 Array = NDArray[np.float64]
@@ -47,10 +47,6 @@ class ReferenceAppearance:
     views : the mesh in each of them.
     sources : (m,) the picture that gives each triangle its texture; the first by default.
     closed : see `rasterise`.
-
-    Attributes
-    ----------
-    facing : (m,) which side of each triangle its picture shows; see `binding.facing`.
     """
 
     def __init__(
@@ -66,14 +62,12 @@ class ReferenceAppearance:
         self._camera = camera
         sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
         # One picture below the other, so that a triangle's place says which one it is from.
-        self._texture = np.ascontiguousarray(np.concatenate(normalized_images))
+        self._texture = pack_texture(np.concatenate(normalized_images))
         self._coordinates = np.empty((len(self._triangles), 3, 3))
-        self.facing = np.empty(len(self._triangles), dtype=bool)
         for number, view in enumerate(views):
             rows = sources == number
             depths, below = view.nodes[:, 2:], np.array([0.0, number * camera.height])
             self._coordinates[rows] = np.hstack([(view.pixels + below) * depths, depths])[self._triangles[rows]]
-            self.facing[rows] = facing(view, self._triangles[rows])
 
     def render(self, view: View) -> Rendering:
         """The object alone, in another view of it."""
@@ -95,17 +89,35 @@ class ReferenceAppearance:
         return Rendering(image, depth, triangle_ids)
 
 
+#: Places in the texture are whole numbers of these parts of a pixel.
+PARTS = 256
+
+
+@njit(cache=True, nogil=True)
+def pack_texture(grey):
+    """A texture (h, w) uint8 with the neighbours to the right, below and diagonal of each pixel in one number, uint32.
+
+    What is interpolated then takes one access. Beyond the border, which is never interpolated towards, is zero.
+    """
+    height, width = grey.shape
+    packed = np.zeros((height, width), np.uint32)
+    for row in range(height):
+        for column in range(width):
+            for i in range(min(2, height - row)):
+                for j in range(min(2, width - column)):
+                    packed[row, column] |= np.uint32(grey[row + i, column + j]) << np.uint32(16 * i + 8 * j)
+    return packed
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _grey_at(texture, x, y):
-    """Grey level of a texture at a place, bilinearly; outside it is its border."""
-    last_row, last_column = texture.shape[0] - 1, texture.shape[1] - 1
-    s, t = min(max(x, 0.0), last_column), min(max(y, 0.0), last_row)
-    s0, t0 = int(s), int(t)
-    s1, t1 = min(s0 + 1, last_column), min(t0 + 1, last_row)
-    a, b = s - s0, t - t0
-    above = (1.0 - a) * texture[t0, s0] + a * texture[t0, s1]
-    below = (1.0 - a) * texture[t1, s0] + a * texture[t1, s1]
-    return np.uint8((1.0 - b) * above + b * below + 0.5)
+def _grey_at(packed, x, y):
+    """Grey level of a packed texture at a place in `PARTS` of a pixel, bilinearly; outside it is its border."""
+    column = int(min(max(x, 0.0), PARTS * (packed.shape[1] - 1)) + 0.5)
+    row = int(min(max(y, 0.0), PARTS * (packed.shape[0] - 1)) + 0.5)
+    four, right, below = np.int64(packed[row >> 8, column >> 8]), column & 255, row & 255
+    # Upper and lower row at once: each of the sums has sixteen bits.
+    both = (four & 0x00FF00FF) * (PARTS - right) + ((four >> 8) & 0x00FF00FF) * right
+    return np.uint8(((both & 0xFFFF) * (PARTS - below) + (both >> 16) * below + 32768) >> 16)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -117,36 +129,46 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     pixels, depths, triangles, closed : see `rasterise`.
     coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth
         in the camera that took it, and that depth; outside it is its border
-    texture : (H, W) uint8.
+    texture : (H, W) of `pack_texture`.
     image, depth, triangle_ids : (h, w) uint8, float32, the unit of ``depths``, and int32; changed where the surface is
         nearest.
     """
-    nodes = pack_nodes(pixels, depths)
+    nodes, terms = pack_nodes(pixels, depths), np.empty((3, 4))
     for t in range(triangles.shape[0]):
-        triangle = triangles[t]
+        triangle, corners = triangles[t], coordinates[t]
         left, right, top, bottom = pixel_window(nodes, triangle, closed, *depth.shape)
         if bottom < top:
             continue
+        # Pixels of the picture are projective on a triangle, not linear: linear are these, of which they are ratios.
+        for i in range(3):
+            q = nodes[triangle[i], 2]
+            terms[i, 0], terms[i, 1] = q, q * corners[i, 2]
+            terms[i, 2], terms[i, 3] = PARTS * q * corners[i, 0], PARTS * q * corners[i, 1]
         b0_first, b1_first, b0_right, b1_right, b0_down, b1_down = corner_weights(nodes, triangle, left, top)
-        q0, q1, q2 = nodes[triangle[0], 2], nodes[triangle[1], 2], nodes[triangle[2], 2]
-        corners = coordinates[t]
+        b2_right = -b0_right - b1_right
+        steps = 1.0 / b0_right, 1.0 / b1_right, 1.0 / b2_right
+        q_right, w_right = _at(terms, 0, b0_right, b1_right, b2_right), _at(terms, 1, b0_right, b1_right, b2_right)
+        x_right, y_right = _at(terms, 2, b0_right, b1_right, b2_right), _at(terms, 3, b0_right, b1_right, b2_right)
         for row in range(top, bottom + 1):
-            b0_left, b1_left = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
-            for column in range(left, right + 1):
-                b0, b1 = b0_left + (column - left) * b0_right, b1_left + (column - left) * b1_right
-                b2 = 1.0 - b0 - b1
-                if not is_inside(b0, b1, b2):
-                    continue
-                w0, w1, w2 = b0 * q0, b1 * q1, b2 * q2
-                z = 1.0 / (w0 + w1 + w2)
-                if not z < depth[row, column]:
-                    continue
-                depth[row, column], triangle_ids[row, column] = z, t
-                # Pixels of the picture are projective on a triangle, not linear: they count by their depths there.
-                scale = 1.0 / (w0 * corners[0, 2] + w1 * corners[1, 2] + w2 * corners[2, 2])
-                x = (w0 * corners[0, 0] + w1 * corners[1, 0] + w2 * corners[2, 0]) * scale
-                y = (w0 * corners[0, 1] + w1 * corners[1, 1] + w2 * corners[2, 1]) * scale
-                image[row, column] = _grey_at(texture, x, y)
+            b0, b1 = b0_first + (row - top) * b0_down, b1_first + (row - top) * b1_down
+            b2 = 1.0 - b0 - b1
+            first, last = covered_steps(b0, b0_right, steps[0], 0.0, float(right - left))
+            first, last = covered_steps(b1, b1_right, steps[1], first, last)
+            first, last = covered_steps(b2, b2_right, steps[2], first, last)
+            q, w = _at(terms, 0, b0, b1, b2), _at(terms, 1, b0, b1, b2)
+            x, y = _at(terms, 2, b0, b1, b2), _at(terms, 3, b0, b1, b2)
+            for k in range(int(np.ceil(first)), int(np.floor(last)) + 1):
+                z, column = np.float32(1.0 / (q + k * q_right)), left + k
+                if z < depth[row, column]:
+                    depth[row, column], triangle_ids[row, column] = z, t
+                    scale = 1.0 / (w + k * w_right)
+                    image[row, column] = _grey_at(texture, (x + k * x_right) * scale, (y + k * y_right) * scale)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _at(terms, number, b0, b1, b2):
+    """A quantity of the corners (3, 4) of a triangle where they have these weights."""
+    return b0 * terms[0, number] + b1 * terms[1, number] + b2 * terms[2, number]
 
 
 #: Pyramid levels that reach as far as a correction may: a quarter of the size, with windows of 17 pixels.
@@ -201,26 +223,30 @@ class Measurement:
     drawing: Drawing | None = None
 
 
-def visible_surface(
-    points: SurfacePoints,
-    positions: Array,
-    pixels: Array,
-    view: View,
-    triangles: NDArray[np.int64],
-    appearance: ReferenceAppearance,
-    rendering: Rendering,
-) -> NDArray[np.bool_]:
-    """Which surface points show the side that the reference view shows, with nothing of the object before it.
+@njit(cache=True, nogil=True)
+def visible_surface(corners, corner_pixels, is_front, broadness, positions, pixels, depth, tolerance):
+    """Which surface points show the side that the reference view shows, broadly enough, with nothing before them.
 
     Parameters
     ----------
-    positions : (p, 3) of the points in the camera frame
-    pixels : (p, 2) of them.
+    corners, corner_pixels : (3 p, 3) in the camera frame, metres, and (3 p, 2) of each point's triangle.
+    is_front : (p,) whether the corners ran clockwise in the reference view's image; see `binding.facing`.
+    broadness : (p,) the least `binding.foreshortening` of the triangles.
+    positions, pixels : (p, 3) and (p, 2) of the points.
+    depth : (h, w) of the object, metres, infinite where it is not.
+    tolerance : metres by which a point may be behind that.
     """
-    same_side = facing(view, triangles[points.triangles]) == appearance.facing[points.triangles]
-    depths = positions[:, 2]
-    tolerance = DEPTH_TOLERANCE * float(np.median(depths))
-    return same_side & visible_points(pixels, depths, rendering.depth, tolerance)
+    seen, (height, width) = np.zeros(len(positions), np.bool_), depth.shape
+    for j in range(len(positions)):
+        a, b, c = corner_pixels[3 * j], corner_pixels[3 * j + 1], corner_pixels[3 * j + 2]
+        area = 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
+        far = (corners[3 * j, 2] + corners[3 * j + 1, 2] + corners[3 * j + 2, 2]) / 3.0
+        x, y = pixels[j, 0], pixels[j, 1]
+        if (area > 0.0) != is_front[j] or not abs(area) * far**2 >= broadness[j]:
+            continue
+        if -0.5 < x < width - 0.5 and -0.5 < y < height - 0.5:
+            seen[j] = positions[j, 2] <= depth[int(np.rint(y)), int(np.rint(x))] + tolerance
+    return seen
 
 
 def compare_with_rendering(

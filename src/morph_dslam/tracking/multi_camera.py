@@ -153,7 +153,7 @@ class RigEstimator:
             seen = replace(estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first:last])
             costs.append(single.linear(view, seen).in_unknowns(chain))
             first = last
-        return LinearCost.joined(costs)
+        return LinearCost.joined(costs, measured.correlation)
 
 
 class RigReference:

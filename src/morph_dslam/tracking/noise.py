@@ -50,7 +50,7 @@ class Observations:
     def redundancy(self) -> float:
         """How many of the points count as one, because their windows overlap."""
         exactness = np.sqrt(self.weights)
-        return float(exactness @ self.correlation @ exactness) / max(float(self.weights.sum()), 1e-300)
+        return float(exactness @ (self.correlation @ exactness)) / max(float(self.weights.sum()), 1e-300)
 
 
 @dataclass(frozen=True)
@@ -100,26 +100,64 @@ def _overlaps(pixels, window):
     """Values, columns and beginnings of the rows of the sparse matrix of shared windows."""
     count = len(pixels)
     from_left = np.argsort(np.where(np.isfinite(pixels[:, 0]), pixels[:, 0], np.inf))
-    found, begins = np.ones(count, np.int32), np.zeros(count + 1, np.int32)
-    for fill in (False, True):
-        if fill:
-            begins[1:] = np.cumsum(found)
-            values, columns = np.ones(begins[-1]), np.empty(begins[-1], np.int32)
-            columns[begins[:-1]] = np.arange(count)
-            found[:] = 1
-        for place, i in enumerate(from_left):
-            for j in from_left[place + 1 :]:
-                right, down = pixels[j, 0] - pixels[i, 0], abs(pixels[i, 1] - pixels[j, 1])
-                if not right < window:
-                    break
-                if down < window:
-                    if fill:
-                        share = (1.0 - right / window) * (1.0 - down / window)
-                        values[begins[i] + found[i]] = values[begins[j] + found[j]] = share
-                        columns[begins[i] + found[i]], columns[begins[j] + found[j]] = j, i
-                    found[i] += 1
-                    found[j] += 1
+    places = pixels[from_left]
+    capacity, n_pairs, found = 16 * count, 0, np.ones(count, np.int32)
+    pairs, shares = np.empty((capacity, 2), np.int32), np.empty(capacity)
+    for a in range(count):
+        for b in range(a + 1, count):
+            right, down = places[b, 0] - places[a, 0], abs(places[b, 1] - places[a, 1])
+            if not right < window:
+                break
+            if down < window:
+                if n_pairs == capacity:
+                    capacity *= 2
+                    pairs, shares = np.concatenate((pairs, np.empty_like(pairs))), np.append(shares, np.empty(n_pairs))
+                i, j = from_left[a], from_left[b]
+                pairs[n_pairs, 0], pairs[n_pairs, 1] = i, j
+                shares[n_pairs] = (1.0 - right / window) * (1.0 - down / window)
+                found[i] += 1
+                found[j] += 1
+                n_pairs += 1
+    begins = np.zeros(count + 1, np.int32)
+    begins[1:] = np.cumsum(found)
+    values, columns, ends = np.ones(begins[-1]), np.empty(begins[-1], np.int32), begins[:-1] + 1
+    columns[begins[:-1]] = np.arange(count)
+    for k in range(n_pairs):
+        for i, j in ((pairs[k, 0], pairs[k, 1]), (pairs[k, 1], pairs[k, 0])):
+            values[ends[i]], columns[ends[i]] = shares[k], j
+            ends[i] += 1
     return values, columns, begins
+
+
+def quadratic(rows: Array, correlation: Correlation, others: Array | None = None) -> Array:
+    """sum_ij K_ij W_i' V_j (n, n) of W and V (p, 2, n), W itself by default, with correlation K (p, p)."""
+    others = rows if others is None else others
+    if isinstance(correlation, scipy.sparse.csr_array):
+        return _sparse_quadratic(correlation.data, correlation.indices, correlation.indptr, rows, others)
+    spread = np.asarray(correlation @ others.reshape(len(others), -1)).reshape(others.shape)
+    return np.tensordot(rows, spread, axes=([0, 1], [0, 1]))
+
+
+@njit(cache=True, nogil=True)
+def _sparse_quadratic(values, columns, begins, rows, others):
+    """`quadratic` with K as the arrays of a sparse matrix by rows; points whose row of W is zero cost nothing."""
+    count, size = rows.shape[2], others.shape[2]
+    found, spread = np.zeros((count, size)), np.empty((2, size))
+    for i in range(len(rows)):
+        if not rows[i].any():
+            continue
+        spread[:] = 0.0
+        for e in range(begins[i], begins[i + 1]):
+            value, other = values[e], others[columns[e]]
+            for c in range(2):
+                for b in range(size):
+                    spread[c, b] += value * other[c, b]
+        for c in range(2):
+            for a in range(count):
+                entry, line = rows[i, c, a], found[a]
+                for b in range(size):
+                    line[b] += entry * spread[c, b]
+    return found
 
 
 #: An estimate that takes up more of the variance leaves too little, as a share, to tell how large it is.
@@ -178,40 +216,28 @@ class PointNoise:
     leaves residuals that all points have alike. A residual's variance is f s² + t, and where the model leaves
     nothing f s^2p, because a part of a window that is covered moves what is found as a whole; f, t and the
     power p are learnt from the residuals of the frames.
+
+    Attributes
+    ----------
+    common : t / f in squared pixels; infinite where the patches do not tell how exact a point is.
+    power : p; 1 where the patches tell too little, or the model leaves something.
     """
 
     def __init__(self) -> None:
         self._moments: Array | None = None
-
-    @property
-    def common(self) -> float:
-        """t / f in squared pixels; infinite where the patches do not tell how exact a point is."""
-        if self._moments is None:
-            return np.inf
-        expected, squared = self._moments.T
-        factor = min((squared[1] - squared[0]) / max(expected[1] - expected[0], 1e-300), LARGEST_FACTOR)
-        if factor <= 0.0:
-            return np.inf
-        return max(float(squared.mean() / factor - expected.mean()), LEAST_SPREAD_PX**2)
-
-    @property
-    def power(self) -> float:
-        """p; 1 where the patches tell too little, or the model leaves something."""
-        if self._moments is None or self.common > LEAST_SPREAD_PX**2:
-            return 1.0
-        expected, squared = np.log(np.maximum(self._moments.T, 1e-300))
-        return float(np.clip((squared[1] - squared[0]) / (expected[1] - expected[0]), 1.0, LARGEST_POWER))
+        self.common, self.power = np.inf, 1.0
 
     def weights(self, spread: Array, used: NDArray[np.bool_]) -> Array:
         """Inverse variances (p,), in that of a typical point; zero for points that are not ``used`` (p,).
 
         ``spread`` (p,) is what the patches tell, see `compare_patches`.
         """
-        common = self.common
-        if np.isinf(common) or not used.any():
+        if np.isinf(self.common) or not used.any():
             return used.astype(float)
-        variance = (spread**2 + common) ** self.power
-        return np.where(used, _middle(variance[used]) / variance, 0.0)
+        variance = spread**2 + self.common
+        if self.power != 1.0:
+            variance = variance**self.power
+        return np.where(used, middle(variance[used]) / variance, 0.0)
 
     def learn(self, spread: Array, residuals: Array, used: NDArray[np.bool_]) -> None:
         """Take in the residuals (p, 2) of a frame: of the better half of the points and of the other."""
@@ -219,19 +245,31 @@ class PointNoise:
         if used.sum() < LEAST_POINTS:
             return
         spread, length = spread[used], np.linalg.norm(residuals[used], axis=1)
-        better = spread <= _middle(spread)
+        better = spread <= middle(spread)
         if better.all():
             return
         moments = np.array(
-            [[_middle(spread[half]) ** 2, (_middle(length[half]) / MEDIAN_OF_PAIR) ** 2] for half in (better, ~better)]
+            [[middle(spread[half]) ** 2, (middle(length[half]) / MEDIAN_OF_PAIR) ** 2] for half in (better, ~better)]
         )
         if moments[:, 1].max() < LEAST_SPREAD_PX**2:
             return  # the reference picture itself, which tells nothing of noise
         before = moments if self._moments is None else self._moments
         self._moments = before + LEARNING_RATE * (moments - before)
+        self.common = _common_variance(self._moments)
+        self.power = 1.0
+        if self.common <= LEAST_SPREAD_PX**2:
+            expected, squared = np.log(np.maximum(self._moments.T, 1e-300))
+            self.power = float(np.clip((squared[1] - squared[0]) / (expected[1] - expected[0]), 1.0, LARGEST_POWER))
 
 
-def _middle(values: Array) -> float:
+def _common_variance(moments: Array) -> float:
+    """`PointNoise.common` of the moments (2, 2), expected and shown, of the better half and the other."""
+    expected, squared = moments.T
+    factor = min((squared[1] - squared[0]) / max(expected[1] - expected[0], 1e-300), LARGEST_FACTOR)
+    return max(float(squared.mean() / factor - expected.mean()), LEAST_SPREAD_PX**2) if factor > 0.0 else np.inf
+
+
+def middle(values: Array) -> float:
     """The upper median of numbers (n,); numpy's own takes five times as long for some hundred."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])

@@ -13,6 +13,7 @@ import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
@@ -140,7 +141,7 @@ class OutlineBalance:
         if not len(across):
             return
         left = max(len(across) - self.outline.redundancy * taken, LEAST_LEFT * len(across))
-        robust = np.median(np.abs(across)) / MEDIAN_OF_NUMBER
+        robust = middle(np.abs(across)) / MEDIAN_OF_NUMBER
         near = np.abs(across) < AGREEING_SIGMAS * max(robust, LEAST_SPREAD_PX)
         variance = robust**2 * len(across) / left
         self.outline.learn(seen.pixels[used][near], across[near, None], float(variance))

@@ -282,13 +282,35 @@ def _part_around(points: Array, shape: tuple[int, ...], levels: int) -> tuple[sl
 
     It begins where pixels of the coarsest level do, so that the levels are those of the whole image.
     """
-    size, points = 1 << levels, np.nan_to_num(points)
-    least, most = points.min(axis=0) - FLOW_WINDOW * size, points.max(axis=0) + FLOW_WINDOW * size
-    left, top = (np.clip(least, 0, None) // size * size).astype(int)
-    right, bottom = np.ceil(most).astype(int) + 1
-    if left >= min(right, shape[1]) or top >= min(bottom, shape[0]):  # nothing is in sight
+    size, (left, top, right, bottom) = 1 << levels, _extent(points)
+    reach = FLOW_WINDOW * size
+    left, top = (int(max(least - reach, 0.0)) // size * size for least in (left, top))
+    right, bottom = (min(math.ceil(most + reach) + 1, end) for most, end in ((right, shape[1]), (bottom, shape[0])))
+    if left >= right or top >= bottom:  # nothing is in sight
         return slice(0, shape[0]), slice(0, shape[1])
-    return slice(int(top), int(min(bottom, shape[0]))), slice(int(left), int(min(right, shape[1])))
+    return slice(top, bottom), slice(left, right)
+
+
+@njit(cache=True, nogil=True)
+def _extent(points):
+    """Least column and row, then largest, of points (p, 2); NaN counts as 0."""
+    least, most = np.full(2, np.inf), np.full(2, -np.inf)
+    for j in range(len(points)):
+        for k in range(2):
+            value = 0.0 if np.isnan(points[j, k]) else points[j, k]
+            least[k], most[k] = min(least[k], value), max(most[k], value)
+    return least[0], least[1], most[0], most[1]
+
+
+@njit(cache=True, nogil=True)
+def zero_where_unknown(numbers):
+    """Numbers (p, k) with zero for NaN; numpy's own takes ten times as long for some hundred."""
+    found = numbers.copy()
+    for j in range(found.shape[0]):
+        for k in range(found.shape[1]):
+            if np.isnan(found[j, k]):
+                found[j, k] = 0.0
+    return found
 
 
 def interior(covered: NDArray[np.bool_], margin: int) -> NDArray[np.uint8]:

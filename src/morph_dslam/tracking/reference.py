@@ -6,6 +6,7 @@ not show, or shows very flat, takes its texture and its points from another.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
@@ -26,6 +27,7 @@ from morph_dslam.tracking.binding import (
     View,
     bind_pixels,
     draw_view,
+    facing,
     foreshortening,
     signed_areas,
     view_of,
@@ -46,7 +48,7 @@ from morph_dslam.tracking.measurement import (
     shown_areas,
     visible_surface,
 )
-from morph_dslam.tracking.noise import Correlation, Observations, window_correlation
+from morph_dslam.tracking.noise import Correlation, Observations, middle, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import Outline
 from morph_dslam.tracking.patches import interior, spread_corners, weaker_slope
@@ -91,8 +93,7 @@ class SurfaceSamples:
             reactions={},
         )
         chosen = points.triangles
-        corners = SurfacePoints(np.repeat(chosen, 3), np.tile(np.eye(3), (N_SAMPLES, 1)))
-        self._corners = BoundPoints.from_surface(model, corners)
+        self._corners = BoundPoints.from_surface(model, points).corners(model)
         normals = triangle_normals(model.nodes, model.triangles[chosen])
         self._areas = 0.5 * np.linalg.norm(normals, axis=1)
 
@@ -110,7 +111,7 @@ class SurfaceSamples:
         positions = self._corners.in_camera(state)
         centres = positions.reshape(-1, 3, 3).mean(axis=1)
         areas = signed_areas(self._camera.project(positions).reshape(-1, 3, 2))
-        tolerance = DEPTH_TOLERANCE * float(np.median(centres[:, 2]))
+        tolerance = DEPTH_TOLERANCE * middle(centres[:, 2])
         shown = visible_points(self._camera.project(centres), centres[:, 2], depth, tolerance)
         shown &= np.isfinite(areas) & ((areas < 0.0) | (not self._closed))
         return np.where(shown, np.nan_to_num(areas) / self._areas, 0.0)
@@ -216,6 +217,8 @@ class ReferenceView:
         least_broadness: float = LEAST_BROADNESS,
     ) -> None:
         self._estimator, self._options, self._views = estimator, options, views
+        # Of the states of the last frames, which are asked for several times.
+        self._projected: deque[tuple[State, Array]] = deque(maxlen=4)
         model, camera, first = estimator.model, estimator.camera, views[0]
         self.state = first.state
         self.surface = surface or DrawnSurface.of(model)
@@ -239,6 +242,10 @@ class ReferenceView:
                 foreshortening(mesh, drawn.triangles[points.surface.triangles])
                 for mesh, points in zip(meshes, bound, strict=True)
             ]
+        )
+        self._corners = drawn.triangles[self.points.surface.triangles].ravel()
+        self._is_front = np.concatenate(
+            [facing(mesh, drawn.triangles[p.surface.triangles]) for mesh, p in zip(meshes, bound, strict=True)]
         )
         self._mask, self._mesh = masks[0], meshes[0]
         self.outline: Outline | None = None
@@ -292,7 +299,12 @@ class ReferenceView:
 
     def projected(self, state: State) -> Array:
         """Where the points (p, 2) are in the image in a state, pixels; NaN behind the camera."""
-        return self._estimator.camera.project(self.points.in_camera(state))
+        for known, pixels in self._projected:
+            if known is state:
+                return pixels.copy()
+        pixels = self._estimator.camera.project(self.points.in_camera(state))
+        self._projected.append((state, pixels))
+        return pixels.copy()
 
     def rendered(self, state: State) -> Rendering:
         """This view as it should appear in a state, contrast-normalized."""
@@ -304,20 +316,20 @@ class ReferenceView:
         ``offsets`` (p, 2) says how far from there, pixels, the points are about to be; None where nothing is known but
         the state.
         """
-        drawn, camera = self.surface.model, self._estimator.camera
+        camera = self._estimator.camera
         with stage("render"):
-            view = view_of(drawn, camera, state)
+            view = view_of(self.surface.model, camera, state)
             rendering = self.appearance.render(view)
         with stage("correct"):
             positions = self.points.in_camera(state)
             predicted = camera.project(positions)
+            tolerance = DEPTH_TOLERANCE * middle(positions[:, 2])
             visible = visible_surface(
-                self.points.surface, positions, predicted, view, drawn.triangles, self.appearance, rendering
-            )
+                view.nodes[self._corners], view.pixels[self._corners], self._is_front, self._least_broadness,
+                positions, predicted, rendering.depth, tolerance,
+            )  # fmt: skip
             if picture.occluder_depth is not None:
-                tolerance = DEPTH_TOLERANCE * float(np.median(positions[:, 2]))
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
-            visible &= foreshortening(view, drawn.triangles[self.points.surface.triangles]) >= self._least_broadness
             found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets)
         return replace(found, drawing=Drawing(state, view, rendering.triangle_ids, rendering.depth))
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.estimator import Estimate, LinearCost, Prior, State
-from morph_dslam.tracking.noise import Correlation, Observations, PixelNoise, RigObservations
+from morph_dslam.tracking.noise import Correlation, Observations, PixelNoise, RigObservations, quadratic
 
 Array = NDArray[np.float64]
 
@@ -134,13 +134,6 @@ class _Past:
         )
 
 
-def quadratic(rows: Array, correlation: Correlation, others: Array | None = None) -> Array:
-    """sum_ij K_ij W_i' V_j (n, n) of W and V (p, 2, n), W itself by default, with correlation K (p, p)."""
-    others = rows if others is None else others
-    spread = np.asarray(correlation @ others.reshape(len(others), -1)).reshape(others.shape)
-    return np.tensordot(rows, spread, axes=([0, 1], [0, 1]))
-
-
 #: Of a plane vector that is at least so many standard deviations long, the direction's error is that of the
 #: linear theory but for some per cent: a vector that points the other way is then less likely than 0.001.
 CLEARLY = 4.0
@@ -248,7 +241,7 @@ class SequenceFilter(Generic[Frame]):
         """
         self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
         linear = self._estimator.linear(measured, alone)
-        self._noise.add(alone.residuals, measured, _taken(measured, linear, alone.state, known))
+        self._noise.add(alone.residuals, measured, _taken(linear, alone.state, known))
         self._unobservable_variance = self._without_effect(measured, linear, alone, known)
         errors = self._errors(measured, linear, alone.state, known)
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
@@ -381,11 +374,10 @@ class SequenceFilter(Generic[Frame]):
         """How the measurements' errors, and those of what is known otherwise, enter the estimate."""
         d, kept = self._unknowns - 6, self._kept
         common, frame = self._noise.common, self._noise.frame
-        by_point = np.sqrt(common) * linear.weighted_jacobian
-        by_frames = frame * quadratic(linear.weighted_jacobian, measured.correlation) + linear.of_depths
+        by_frames = frame * linear.spread + linear.of_depths
         by_factor, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
         by_views: dict[int, Array] = {}
-        hessian = linear.hessian.copy()
+        by_point, hessian = np.sqrt(common) * linear.weighted_jacobian, linear.hessian.copy()
         if known is not None:
             information, by_factor = known.terms(state)[1], known.lasting_push
             hessian += information
@@ -401,11 +393,14 @@ class SequenceFilter(Generic[Frame]):
             by_factor[: len(self._past.by_factor), kept] += self._past.by_factor @ weight
             unseen[np.ix_(kept, kept)] += weight @ self._past.unseen @ weight
             by_views = {view: rows @ weight for view, rows in self._past.by_views.items()}
-        linear = replace(linear, hessian=hessian)
+        # Without a past it is the spread of this frame's points alone, which is known already.
+        of_points = common * linear.spread if past is None else quadratic(by_point, measured.correlation)
+        linear = linear if known is None and past is None else replace(linear, hessian=hessian)
         inverse = linear.inverse
-        by_point, by_frames, by_factor = by_point @ inverse, inverse @ by_frames @ inverse, by_factor @ inverse
+        by_point = by_point @ inverse if len(kept) else by_point[:0]
+        by_frames, by_factor = inverse @ by_frames @ inverse, by_factor @ inverse
         unseen = inverse @ unseen @ inverse + (common + frame) * linear.unseen
-        covariance = quadratic(by_point, measured.correlation) + by_frames + by_factor.T @ by_factor + unseen
+        covariance = inverse @ of_points @ inverse + by_frames + by_factor.T @ by_factor + unseen
         if past is not None and self._past is not None:
             by_views = {view: rows @ inverse[kept] for view, rows in by_views.items()}
             for view, rows in by_views.items():
@@ -413,15 +408,14 @@ class SequenceFilter(Generic[Frame]):
         return _Errors(by_point, by_frames, by_factor, unseen, covariance, inverse, by_views)
 
 
-def _taken(measured: Observations | RigObservations, linear: LinearCost, state: State, known: Prior | None) -> float:
+def _taken(linear: LinearCost, state: State, known: Prior | None) -> float:
     """How many numbers' worth of its measurements' variance an estimate takes up.
 
     Of errors with the correlation K it is tr(H^-1 J' W^1/2 K W^1/2 J): the number of unknowns where they are
     independent, and more where neighbours err alike.
     """
-    hessian = linear.hessian if known is None else linear.hessian + known.terms(state)[1]
-    spread = quadratic(linear.weighted_jacobian, measured.correlation)
-    return float(np.trace(replace(linear, hessian=hessian).inverse @ spread))
+    informed = linear if known is None else replace(linear, hessian=linear.hessian + known.terms(state)[1])
+    return float(np.trace(informed.inverse @ linear.spread))
 
 
 def _longer(rows: Array, count: int) -> Array:

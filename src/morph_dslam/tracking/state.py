@@ -55,6 +55,16 @@ class BoundPoints:
         rest = np.concatenate([self.rest, other.rest])
         return BoundPoints(surface, rest, self.field.with_modes(modes))
 
+    def corners(self, model: ReducedModel) -> BoundPoints:
+        """The three corners of each point's triangle, (3 p) points."""
+        surface = SurfacePoints(np.repeat(self.surface.triangles, 3), np.tile(np.eye(3), (len(self), 1)))
+        return BoundPoints.from_surface(model, surface)
+
+    def take(self, rows: NDArray[np.int64]) -> BoundPoints:
+        """The points at ``rows`` (k,)."""
+        field = self.field.with_modes(self.field.modes[:, rows])
+        return BoundPoints(self.surface.take(rows), self.rest[rows], field)
+
     def in_camera(self, state: State) -> Array:
         """Positions (p, 3) in the camera frame, metres."""
         pose = state.camera_from_object
@@ -100,17 +110,13 @@ class Prior:
 
     def terms(self, state: State) -> tuple[float, Array, Array]:
         """Cost, Hessian (d + 6, d + 6) and gradient (d + 6,) of the prior at a state."""
-        d = len(self.mean)
-        hessian, gradient = np.zeros((d + 6, d + 6)), np.zeros(d + 6)
-        away = state.parameters - self.mean
-        hessian[:d, :d], gradient[:d] = self.information, self.information @ away
-        cost = 0.5 * float(away @ gradient[:d])
-        if self.pose is not None and self.pose_information is not None:
-            known, pose = self.pose, state.camera_from_object
-            arrays = (self.pose_information, known.rotation, known.translation, pose.rotation, pose.translation)
-            of_pose, hessian[d:, d:], gradient[d:] = _pose_terms(*map(np.ascontiguousarray, arrays))
-            cost += of_pose
-        return cost, hessian, gradient
+        known, of_pose = self.pose, self.pose_information
+        if known is None or of_pose is None:
+            known, of_pose = state.camera_from_object, _NOTHING
+        there = state.camera_from_object
+        arrays = (self.mean, self.information, of_pose, known.rotation, known.translation)
+        arrays = (*arrays, state.parameters, there.rotation, there.translation)
+        return _prior_terms(*map(np.ascontiguousarray, arrays))
 
     def placed(self, state: State) -> State:
         """The state in the known pose, if there is one."""
@@ -165,3 +171,22 @@ def _pose_terms(information, known_rotation, known_translation, rotation, transl
     slope[:3, :3] = _log_slope(away[:3])
     push = information @ away
     return 0.5 * (away @ push), slope.T @ information @ slope, slope.T @ push
+
+
+@njit(cache=True, nogil=True)
+def _prior_terms(
+    mean, information, pose_information, known_rotation, known_translation, parameters, rotation, translation
+):
+    """What `Prior.terms` returns, compiled; the arguments are those of the prior, then those of the state."""
+    d = len(mean)
+    hessian, gradient = np.zeros((d + 6, d + 6)), np.zeros(d + 6)
+    away = parameters - mean
+    hessian[:d, :d], gradient[:d] = information, information @ away
+    of_pose, hessian[d:, d:], gradient[d:] = _pose_terms(
+        pose_information, known_rotation, known_translation, rotation, translation
+    )
+    return 0.5 * (away @ gradient[:d]) + of_pose, hessian, gradient
+
+
+#: The information of an unknown pose.
+_NOTHING = np.zeros((6, 6))

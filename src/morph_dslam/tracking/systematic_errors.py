@@ -24,10 +24,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State, project_with_jacobian
 
@@ -154,7 +154,7 @@ class SystematicErrors:
     ) -> None:
         self._estimator, self._points, self._still = estimator, points, still
         self._misfit = ReferenceMisfit()
-        self._corners = _corners(estimator, points)
+        self._corners = points.corners(estimator.model)
         edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
         size = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -228,7 +228,7 @@ class SystematicErrors:
         gain = inverse_of_seen(hessian, self._estimator.scale)
         covariance, by_reference = estimate.covariance.copy(), self._by_reference
         if self._moved is not None:
-            moved = self._warps(estimate.state) @ self._moved
+            moved = self._warped(estimate.state, self._moved)
             by_reference = gain @ (frame.products(moved) + past @ self._by_reference)
             if self._still and self._factors is not None:
                 # The pose's error moves the points on the surface, and the object with them: both count together.
@@ -250,10 +250,9 @@ class SystematicErrors:
 
     def _learn_reference(self, frame: _Linearization, left: Array) -> None:
         """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""
-        n_pairs = self._common.n_pairs(frame.usable)
-        both = (frame.residuals[:, :, None], left)
-        shown, expected = (np.trace(self._common.in_common(rows, n_pairs)) for rows in both)
-        self._misfit.learn(float(shown), float(expected))
+        both = np.concatenate([frame.residuals[:, :, None], left], axis=2)
+        shown, *expected = np.diag(self._common.in_common(both, self._common.n_pairs(frame.usable)))
+        self._misfit.learn(float(shown), float(sum(expected)))
 
     def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
         """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
@@ -265,19 +264,13 @@ class SystematicErrors:
         """
         assert self._moved is not None
         frame = self._linearized(estimate, weights)
-        return frame.hessian, frame.products(self._warps(estimate.state) @ self._moved)
+        return frame.hessian, frame.products(self._warped(estimate.state, self._moved))
 
     def _linearized(self, estimate: Estimate, weights: Array) -> _Linearization:
         """The frame of an estimate whose points had these ``weights`` (p,)."""
         _, jacobian = self._project(estimate.state)
-        residuals = estimate.residuals[: len(weights)]
-        length = np.linalg.norm(residuals, axis=1)
-        usable = (weights > 0.0) & np.isfinite(length) & np.isfinite(jacobian).all(axis=(1, 2))
-        huber = self._estimator.options.huber_px
-        weights = np.where(usable, weights * np.minimum(1.0, huber / np.maximum(length, 1e-300)), 0.0)
-        residuals = np.where(usable[:, None], residuals, 0.0)
-        jacobian = np.where(usable[:, None, None], jacobian, 0.0)
-        return _Linearization(usable, residuals, jacobian, weights[:, None, None] * jacobian)
+        residuals, huber = estimate.residuals[: len(weights)], self._estimator.options.huber_px
+        return _Linearization(*_counting(jacobian, np.ascontiguousarray(residuals), weights, huber))
 
     def _project(self, state: State) -> tuple[Array, Array]:
         points, pose = self._points, state.camera_from_object
@@ -286,12 +279,48 @@ class SystematicErrors:
             points.field.modes, self._estimator.camera.intrinsics,
         )  # fmt: skip
 
-    def _warps(self, state: State) -> Array:
-        """How pixels (p, 2, 2) move in a view where they move by one in the reference view."""
-        with np.errstate(invalid="ignore"):
-            warps = _edges(self._estimator.camera, self._corners, state) @ self._inverse_edges
-            usable = np.abs(warps).max(axis=(1, 2)) < LARGEST_STRETCH
-        return np.where(usable[:, None, None], warps, 0.0)
+    def _warped(self, state: State, moved: Array) -> Array:
+        """How pixels move (p, 2, c) in a view where they move by ``moved`` (p, 2, c) in the reference view."""
+        pixels = self._estimator.camera.project(self._corners.in_camera(state))
+        return _warped_motions(pixels, self._inverse_edges, moved)
+
+
+@njit(cache=True, nogil=True)
+def _counting(jacobian, residuals, weights, huber):
+    """What `_Linearization` holds, of all points' Jacobian (p, 2, n), residuals (p, 2) and weights (p,)."""
+    usable = np.zeros(len(weights), np.bool_)
+    seen, left, weighted = np.zeros_like(jacobian), np.zeros_like(residuals), np.zeros_like(jacobian)
+    for j in range(len(weights)):
+        length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
+        if weights[j] > 0.0 and np.isfinite(length + np.sum(jacobian[j])):
+            usable[j] = True
+            weight = weights[j] * min(1.0, huber / max(length, 1e-300))
+            left[j], seen[j], weighted[j] = residuals[j], jacobian[j], weight * jacobian[j]
+    return usable, left, seen, weighted
+
+
+@njit(cache=True, nogil=True)
+def _warped_motions(pixels, inverse_edges, moved):
+    """Motions (p, 2, c) of pixels, by the warp E E0^-1 of the edges of each one's triangle; zero where that is large.
+
+    Parameters
+    ----------
+    pixels : (3 p, 2) of the triangles' corners.
+    inverse_edges : (p, 2, 2) E0^-1, of two edges as columns in the reference view.
+    moved : (p, 2, c) motions there.
+    """
+    found, warp = np.zeros_like(moved), np.empty((2, 2))
+    for j in range(len(moved)):
+        for row in range(2):
+            first = pixels[3 * j + 1, row] - pixels[3 * j, row]
+            second = pixels[3 * j + 2, row] - pixels[3 * j, row]
+            for column in range(2):
+                warp[row, column] = first * inverse_edges[j, 0, column] + second * inverse_edges[j, 1, column]
+        if np.isfinite(np.sum(warp)) and np.abs(warp).max() < LARGEST_STRETCH:
+            for row in range(2):
+                for k in range(moved.shape[2]):
+                    found[j, row, k] = warp[row, 0] * moved[j, 0, k] + warp[row, 1] * moved[j, 1, k]
+    return found
 
 
 def inverse_of_seen(hessian: Array, scale: Array) -> Array:
@@ -305,14 +334,6 @@ def inverse_of_seen(hessian: Array, scale: Array) -> Array:
 def _by_parts(parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
     """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
     return np.concatenate([of_state(part.state)[part.rows] for part in parts])
-
-
-def _corners(estimator: Estimator, points: BoundPoints) -> BoundPoints:
-    """The three corners of each point's triangle, (3 p) points."""
-    surface = SurfacePoints(np.repeat(points.surface.triangles, 3), np.tile(np.eye(3), (len(points), 1)))
-    model = estimator.model
-    nodes = model.triangles[points.surface.triangles].ravel()
-    return BoundPoints(surface, model.nodes[nodes], model.displacement.with_modes(model.displacement.modes[:, nodes]))
 
 
 def _edges(camera: Camera, corners: BoundPoints, state: State) -> Array:

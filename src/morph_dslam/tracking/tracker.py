@@ -24,10 +24,16 @@ from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
-from morph_dslam.tracking.frame_estimation import at_constant_velocity, new_filter, with_unobservable_at_default
+from morph_dslam.tracking.frame_estimation import (
+    a_turn_back,
+    at_constant_velocity,
+    new_filter,
+    with_unobservable_at_default,
+)
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
+from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraLost,
@@ -43,7 +49,7 @@ from morph_dslam.tracking.outcomes import (
     SurfaceJumps,
     TrackingWarning,
 )
-from morph_dslam.tracking.patches import follow, normalize_contrast
+from morph_dslam.tracking.patches import LEVELS, follow, normalize_contrast, zero_where_unknown
 from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
@@ -250,10 +256,11 @@ class Tracker:
             rows = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
             last = self.reference.projected(self._last)
             guesses = self._pixels + self._expected_motion(last, prior)
-            found, ok = follow(self._image.normalized, image.normalized, self._pixels[rows], guesses[rows])
+            # Half of the size is exact enough for a start.
+            found, ok = follow(self._image.half, image.half, 0.5 * self._pixels[rows], 0.5 * guesses[rows], LEVELS - 1)
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
-            pixels[rows], valid[rows] = found, ok
-            return Followed(pixels, valid, np.nan_to_num(self._pixels - last))
+            pixels[rows], valid[rows] = 2.0 * found, ok
+            return Followed(pixels, valid, zero_where_unknown(self._pixels - last))
 
     def _match(self, image: Image, followed: Followed | None, prior: Prior | None) -> PoseHypothesis:
         """Compare with the rendered reference view and solve for pose and parameters."""
@@ -487,8 +494,8 @@ class Tracker:
         ``last`` (p, 2) is where the points were in the last state.
         """
         if prior is not None and prior is not self._still:
-            return np.nan_to_num(self.reference.projected(prior.placed(self._last)) - last)
-        return np.nan_to_num(last - self.reference.projected(self._velocity_base))
+            return zero_where_unknown(self.reference.projected(prior.placed(self._last)) - last)
+        return zero_where_unknown(last - self.reference.projected(self._velocity_base))
 
     def _learn(self, image: Image, hypothesis: PoseHypothesis) -> None:
         """Take in an accepted frame."""
@@ -499,13 +506,14 @@ class Tracker:
             self.last_seen = Keyframe(pixels, weights, estimate.state, estimate.sigma_px, hypothesis.outline)
             if not hypothesis.outline_alone:
                 shape = self.reference.points.field.value(estimate.state.parameters)
-                depth = float(np.median(self.reference.points.in_camera(estimate.state)[:, 2]))
+                depth = middle(self.reference.points.in_camera(estimate.state)[:, 2])
                 self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
         if self.estimator.loads is not None:
             self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
-        self._start = with_unobservable_at_default(self.model, estimate)
+        angles = self._registration.per_sequence
+        self._start = a_turn_back(self.model, with_unobservable_at_default(self.model, estimate), estimate, angles)
         if self.options.start == "constant-velocity":
             self._start = at_constant_velocity(self._velocity_base, self._start)
         self._supported = inliers
