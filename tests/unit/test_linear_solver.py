@@ -60,6 +60,14 @@ def test_solves_an_unsymmetric_matrix(engine) -> None:
     np.testing.assert_allclose(solution[free], np.linalg.solve(dense[np.ix_(free, free)], right[free]))
 
 
+def test_the_folder_is_not_searched_for_the_library_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pypardiso", reason="pypardiso is not installed")
+    right, free = np.arange(3.0), np.ones(3, dtype=bool)
+    factorised(np.eye(3), free, "pardiso")
+    monkeypatch.setattr("glob.glob", lambda *_, **__: pytest.fail("searched again"))
+    np.testing.assert_allclose(factorised(2.0 * np.eye(3), free, "pardiso").solve(right), 0.5 * right)
+
+
 @pytest.mark.parametrize(("n", "negative"), [(1, 1), (12, 2), (60, 0), (60, 4)])
 def test_counts_negative_eigenvalues(engine, n, negative) -> None:
     dense = random_symmetric(n, negative)

@@ -119,6 +119,32 @@ def cubic(tangents: list[float]) -> SmallSystem:
     return SmallSystem(1, lambda x, mu: x**3 + x - mu, tangent, lambda *_: np.array([[-1.0]]))
 
 
+def root_of_cubic(load: float) -> float:
+    (root,) = [r.real for r in np.roots([1.0, 0.0, 1.0, -load]) if abs(r.imag) < 1e-12]
+    return root
+
+
+def test_a_smooth_path_takes_one_tangent_a_step_where_single_steps_take_two() -> None:
+    loads, tangents = np.linspace(2.0, 10.0, 9), []
+    states = advance(cubic(tangents), State(np.array([2.0]), np.array([1.0])), loads[1:, None])
+    assert [state.dofs[0] for state in states] == pytest.approx([root_of_cubic(load) for load in loads], abs=1e-8)
+    assert len(tangents) <= 10
+    alone: list[float] = []
+    for load, before in zip(loads[1:], states, strict=False):
+        solve(cubic(alone), np.array([load]), before)
+    assert len(alone) >= 15
+
+
+def test_a_path_with_a_corner_is_followed_to_its_end() -> None:
+    """What is foretold beyond the corner is wrong, and lies beyond where the residual is a number at all."""
+    loads = np.concatenate([np.linspace(0.0, 2.0, 9), np.linspace(1.5, -2.0, 8)])
+    system = cubic([])
+    system.residual = lambda x, mu: np.full(1, np.nan) if x[0] > 1.05 else x**3 + x - mu
+    states = advance(system, at_rest(), loads[1:, None])
+    assert len(states) == len(loads)
+    assert [state.dofs[0] for state in states] == pytest.approx([root_of_cubic(load) for load in loads], abs=1e-8)
+
+
 def slope(value: float) -> Linearisation:
     """A tangent of one unknown."""
     system = SmallSystem(1, lambda x, _: x, lambda *_: np.array([[value]]), lambda *_: np.zeros((1, 1)))
@@ -130,8 +156,7 @@ def test_a_kept_tangent_leads_to_the_root_and_is_made_anew_only_if_too_far_off(g
     tangents: list[float] = []
     state = solve_with_kept_tangent(cubic(tangents), np.array([2.2]), np.array([guess]), slope(kept))
     assert state is not None
-    (root,) = [r.real for r in np.roots([1.0, 0.0, 1.0, -2.2]) if abs(r.imag) < 1e-12]
-    assert state.dofs[0] == pytest.approx(root, abs=1e-8)
+    assert state.dofs[0] == pytest.approx(root_of_cubic(2.2), abs=1e-8)
     assert len(tangents) == (0 if kept == 4.0 else 1)
 
 

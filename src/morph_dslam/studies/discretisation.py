@@ -1,8 +1,8 @@
 """The discretisation error of a study's solutions: a few held-out ones are solved again with elements one order higher.
 
-States are chosen by their strain alone, before anything is solved. How many can be afforded follows from numbers of
-unknowns, so that it is the same in every run; the clock ends what takes longer than foreseen, and the certificate says
-what was left out and why.
+States are chosen by their strain alone, before anything is solved. How many can be afforded, in a quarter of the
+build's time or 20 seconds, follows from numbers of unknowns, so that it is the same in every run; the clock ends what
+takes longer than foreseen, and the certificate says what was left out and why.
 """
 
 from __future__ import annotations
@@ -38,23 +38,30 @@ from morph_dslam.studies.solutions import Snapshots
 from morph_dslam.studies.study import Study
 
 Array = NDArray[np.float64]
-#: Part of the whole build that the estimate may take.
-SHARE = 0.25
+#: Part of the whole build that the estimate may take, and seconds that it may take of any build: short ones consist of
+#: more than solves, and whoever waits a minute would rather know.
+SHARE, FLOOR = 0.25, 20.0
 #: Part of that time at which no tangent is begun any more: the last one must end, and fields be recovered.
 CLOCK = 0.8
 MOST_BYTES = 4e9
 #: Places of the states to solve again among the held-out ones sorted by strain, the first ones if there is less time.
 QUANTILES = (1.0, 0.5, 0.75, 0.25, 0.9)
-#: Tangents of a finer solve, and of one of the sweep; powers of the number of unknowns with which the time of a
-#: tangent and the memory of its factors grow (measured on seals of 7 thousand to 110 thousand unknowns; nested
-#: dissection has 2 and 4/3 in the limit).
-FINER_TANGENTS, SWEEP_TANGENTS, TIME_POWER, MEMORY_POWER = 3.5, 3.0, 1.5, 4.0 / 3.0
+#: Tangents of a finer solve (measured: 0.6 to 1.5, and 3.2 on a bellows of one element through the wall), and of one of
+#: the sweep; powers of the number of unknowns with which the time of a tangent and the memory of its factors grow
+#: (measured on seals of 7 thousand to 110 thousand unknowns; nested dissection has 2 and 4/3 in the limit).
+FINER_TANGENTS, SWEEP_TANGENTS, TIME_POWER, MEMORY_POWER = 2.5, 3.0, 1.5, 4.0 / 3.0
+#: Time of a tangent of so many unknowns, on one core. It stands for every machine's, so that the number of states does
+#: not depend on the machine.
+SECONDS_OF_A_MILLION = 340.0
 BYTES_OF_A_MILLION = 45e9
 #: The same of an iterative solve: time in units of a tangent of the study's elements and of the ratio of unknowns
 #: (measured on a seal of 287 thousand), memory of an unknown (6 kB on that seal, 12 kB on hexahedra of third order).
 ITERATIVE_TANGENTS, ITERATIVE_BYTES = 6.0, 12e3
 #: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
 TOLERANCE, PART = 1e-2, 0.03
+
+
+_LIMIT = f"a quarter of the build and {FLOOR:.0f} s"
 
 
 class _NotEstimated(Exception):
@@ -120,7 +127,7 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
     kept = {index: load_state(snapshots.held_out_files[index]) for index in chosen}
     # Where solutions were found on disk, this build was shorter than the one that solved them.
     solving = SWEEP_TANGENTS * _tangent_seconds(sweep.problem, kept[chosen[0]]) * solves / (study.work.workers or 1)
-    end = begin + CLOCK * SHARE / (1.0 - SHARE) * max(seconds, solving)
+    end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * max(seconds, solving), FLOOR)
     announce(f"solving {len(chosen)} held-out states again with finer elements")
     solved, left_out = {}, ""
     if not finer.iterative:
@@ -130,7 +137,7 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
         try:
             solved[index] = finer.solve(kept[index]["dofs"], kept[index]["mu"], lambda: time.monotonic() < end)
         except OutOfTime:
-            left_out = f"{len(chosen) - len(solved)} were left out: they would take more than a quarter of the build"
+            left_out = f"{len(chosen) - len(solved)} were left out: they would take more than {_LIMIT}"
             break
         except SolverError as error:
             left_out = f"one was left out: {error}"
@@ -142,7 +149,9 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
 
 
 def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
-    """How many finer states a quarter of a build of ``solves`` can afford; ``unknowns`` are those of `_unknowns`.
+    """How many finer states a quarter of a build of ``solves``, or `FLOOR`, can afford.
+
+    ``unknowns`` are those of `_unknowns`.
 
     Raises _NotEstimated where memory or time allow none.
     """
@@ -152,11 +161,12 @@ def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
         raise _NotEstimated(f"{finer} unknowns of finer elements would need about {1e-9 * memory:.0f} GB of memory")
     tangents = ITERATIVE_TANGENTS * finer / own if iterative else FINER_TANGENTS * (finer / own) ** TIME_POWER
     time_of_one = tangents / SWEEP_TANGENTS
-    count = int(SHARE / (1.0 - SHARE) * solves / time_of_one)
+    seconds_of_one = tangents * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
+    count = int(max(SHARE / (1.0 - SHARE) * solves / time_of_one, FLOOR / seconds_of_one))
     if count < 1:
         raise _NotEstimated(
             f"one state with {finer} unknowns of finer elements would take as long as {time_of_one:.0f} of the build's "
-            f"{solves} solves, more than a quarter of the build"
+            f"{solves} solves, more than {_LIMIT}"
         )
     return count
 

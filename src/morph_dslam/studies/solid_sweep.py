@@ -124,7 +124,7 @@ def response_reactions(
 
 
 def follow(problem: SolidProblem, start: State, target: Array) -> State:
-    """Solve at ``target`` (d,) in increments from ``start``."""
+    """Solve at ``target``, (d,) or (k, d) in turn, in increments from ``start``."""
     try:
         return advance(problem, start, target)[-1]
     except PathError as error:
@@ -283,8 +283,7 @@ class ViscousSweep:
         first.history.restore(memory)
         state = loaded_state(first, moments[0])
         first.advance_history(state.dofs, state.mu)
-        for moment in moments[1:]:
-            state = follow(first, state, moment)
+        state = follow(first, state, np.array(moments[1:]))
         history.restore(first.history.values())
         return state.dofs
 
@@ -323,8 +322,9 @@ class ViscousSweep:
         if not np.array_equal(at_once, start.mu):
             state = follow(self.problem, state, at_once)
         count = int(np.ceil((end - begin) / self._step - 1e-9))
-        for time in np.linspace(begin, end, count + 1)[1:]:
-            state = follow(self.problem, state, self._at_time(target, time))
+        if count:
+            moments = [self._at_time(target, time) for time in np.linspace(begin, end, count + 1)[1:]]
+            state = follow(self.problem, state, np.array(moments))
         return self._with_memory(State(target, state.dofs))
 
     def _at_time(self, mu: Array, time: float) -> Array:

@@ -1,4 +1,8 @@
-"""Load stepping: from a solved state to new parameters, and from the undeformed body to its first loads."""
+"""Load stepping: from a solved state to new parameters, and from the undeformed body to its first loads.
+
+Where a path has several steps, each starts from the polynomial through the solutions before (Allgower and Georg,
+Numerical Continuation Methods, 1990, section 6.3). A smooth path then takes little more than one factorisation a step.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, in_contact, solve
+from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, in_contact, size, solve
 
 Array = NDArray[np.float64]
 AnyState = TypeVar("AnyState")
+#: Highest degree of the polynomial that predicts the next solution.
+MOST_DEGREE = 4
 #: The path is given up when an increment falls below this part of it.
 SMALLEST_INCREMENT = 1.0 / 64.0
 
@@ -58,34 +64,111 @@ def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState
     return state
 
 
+class _Extrapolation:
+    """Polynomials through the latest solutions on a path.
+
+    Parameters
+    ----------
+    equations : what is solved.
+    start : (n,) solution at place 0.
+    """
+
+    def __init__(self, equations: Equations, start: Array) -> None:
+        self._equations = equations
+        self._places, self._solutions, self._degree = [0.0], [start], 0
+
+    def at(self, place: float) -> Array | None:
+        """The solution (n,) to expect at a place further on; None where the latest one would do better."""
+        return self._polynomial(self._degree, place) if self._degree else None
+
+    def add(self, place: float, solution: Array) -> None:
+        """Take the solution (n,) at a place, and the degree that would have foretold it best.
+
+        Where that is the highest one there could be, it is raised: smooth paths end at `MOST_DEGREE`, rough ones at
+        lower degrees.
+        """
+        tried = range(len(self._places))
+        missed = [size(self._equations, self._polynomial(degree, place) - solution) for degree in tried]
+        best = int(np.argmin(missed))
+        self._degree = min(best + (best == tried[-1]), MOST_DEGREE)
+        self._places = [*self._places, place][-MOST_DEGREE - 1 :]
+        self._solutions = [*self._solutions, solution][-MOST_DEGREE - 1 :]
+
+    def _polynomial(self, degree: int, place: float) -> Array:
+        """Lagrange's polynomial through the latest ``degree`` + 1 solutions."""
+        known = np.array(self._places[-degree - 1 :])
+        others = ~np.eye(len(known), dtype=bool)
+        ratios = (place - known[None]) / np.where(others, known[:, None] - known[None], 1.0)
+        weights = np.prod(ratios, axis=1, where=others)
+        return weights @ np.array(self._solutions[-degree - 1 :])
+
+
 def advance(equations: Equations, start: State, target: Array, tolerance: float = TOLERANCE) -> list[State]:
-    """Solve at ``target`` (d,) along the straight line from ``start``, in increments as large as converge.
+    """Solve at ``target``, along straight lines, in increments as large as converge.
 
     Raises PathError naming the last parameters that converged; it carries the states up to there.
 
+    Parameters
+    ----------
+    equations : what is solved.
+    start : a solution.
+    target : (d,) parameters, or (k, d) ones to solve at in turn; best so that they are smooth in their number, for
+        solutions are extrapolated over it.
+    tolerance : of Newton's method.
+
     Returns
     -------
-    The states along the line, ``start`` first.
+    The states along the way, ``start`` first: those at ``target``, and between them where increments were needed.
     """
-    origin, goal = start.mu, np.asarray(target, dtype=float)
-    states: list[State] = [start]
-
-    def attempt(fraction: float, nearby: State) -> State:
-        state = solve(equations, origin + fraction * (goal - origin), nearby, tolerance)
-        if isinstance(equations, _History):
-            equations.advance_history(state.dofs, state.mu)
-        states.append(state)
-        return state
-
+    path = _Path(equations, start, tolerance)
     try:
-        step_towards(attempt, start)
+        for number, goal in enumerate(np.atleast_2d(np.asarray(target, dtype=float))):
+            path.lead_to(goal, number)
     except SolverError as error:
         raise PathError(
-            f"{error}; the last parameters that converged are {states[-1].mu}. A load that the body cannot "
+            f"{error}; the last parameters that converged are {path.states[-1].mu}. A load that the body cannot "
             "carry (a limit point) needs arc length, or an imposed displacement in its place",
-            states,
+            path.states,
         ) from error
-    return states
+    return path.states
+
+
+class _Path:
+    """Solutions one after another.
+
+    Attributes
+    ----------
+    states : solved so far, the start first.
+    """
+
+    def __init__(self, equations: Equations, start: State, tolerance: float) -> None:
+        self._equations, self._tolerance, self.states = equations, tolerance, [start]
+        self._expected = _Extrapolation(equations, start.dofs)
+
+    def lead_to(self, goal: Array, number: int) -> None:
+        """Go on to the parameters ``goal`` (d,), the ``number``-th target, along a straight line."""
+        origin = self.states[-1].mu
+
+        def attempt(fraction: float, _: State) -> State:
+            return self._step(origin + fraction * (goal - origin), number + fraction)
+
+        step_towards(attempt, self.states[-1])
+
+    def _step(self, mu: Array, place: float) -> State:
+        state = self._solve(mu, self._expected.at(place))
+        if isinstance(self._equations, _History):
+            self._equations.advance_history(state.dofs, state.mu)
+        self.states.append(state)
+        self._expected.add(place, state.dofs)
+        return state
+
+    def _solve(self, mu: Array, guess: Array | None) -> State:
+        if guess is not None:
+            try:
+                return solve(self._equations, mu, State(mu, guess), self._tolerance)
+            except SolverError:
+                pass  # the path bends here: by its tangent it may go on
+        return solve(self._equations, mu, self.states[-1], self._tolerance)
 
 
 @dataclass

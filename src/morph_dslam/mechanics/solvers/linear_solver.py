@@ -42,6 +42,8 @@ SCALING, MATCHING = 11, 13
 REAL_SYMMETRIC_INDEFINITE, REAL_UNSYMMETRIC = -2, 11
 ANALYSE, FACTORISE, SOLVE = 11, 22, 33
 PERTURBED_PIVOTS, NEGATIVE_EIGENVALUES = 14, 23
+#: Where pypardiso looks for MKL before it searches.
+LIBRARY_VARIABLE = "PYPARDISO_MKL_RT"
 #: Without PARDISO, negative eigenvalues are counted among so many nearest to zero.
 LOOKED_AT = 6
 
@@ -54,6 +56,8 @@ class Pardiso:
 
         self._symmetric = symmetric
         self._handle: Any = PyPardisoSolver(REAL_SYMMETRIC_INDEFINITE if symmetric else REAL_UNSYMMETRIC)
+        # pypardiso would search the whole environment's folder again for every solver: half a second and more.
+        os.environ.setdefault(LIBRARY_VARIABLE, self._handle.libmkl._name)
         for number, value in PARDISO_SETTINGS.items():
             self._handle.set_iparm(number, value)
         if threads is not None:
