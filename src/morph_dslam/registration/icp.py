@@ -61,16 +61,16 @@ class Surface:
         """Nearest-point search."""
         return KDTree(self.points, leafsize=20)  # a quarter faster than with ten
 
-    def nearest(self, points: Array, viewpoints: Array) -> NDArray[np.int64]:
+    def nearest(self, points: Array, viewpoints: Array, within: float = np.inf) -> NDArray[np.int64]:
         """The nearest sample (p,) to each point (p, 3) that faces its viewpoint (p, 3), object frame.
 
-        On a thin wall the nearest sample may be on the other side. Open surfaces are seen from both sides.
+        On a thin wall the nearest sample may be on the other side. Open surfaces are seen from both sides. Where there
+        is none ``within`` a distance, metres, it is one more than the last.
         """
         if not self.closed:
-            return np.asarray(self.tree.query(points)[1], dtype=np.int64)
-        neighbours = np.asarray(self.tree.query(points, k=self._n_neighbours)[1], dtype=np.int64)
-        facing = np.einsum("pkx,px->pk", self.normals[neighbours], viewpoints - points) > 0.0
-        return neighbours[np.arange(len(points)), facing.argmax(axis=1)]
+            return np.asarray(self.tree.query(points, distance_upper_bound=within)[1], dtype=np.int64)
+        _, near = self.tree.query(points, k=self._n_neighbours, distance_upper_bound=within)
+        return first_facing(near, self.points, self.normals, points, viewpoints)
 
     @cached_property
     def _n_neighbours(self) -> int:
@@ -181,41 +181,81 @@ def surface_equations(
     to_planes : as of `fit_surface`.
     """
     inverse = place.inverse
-    nearest = surface.nearest(inverse.apply(points.positions), inverse.apply(points.viewpoints))
-    arms = place.scale * (surface.points[nearest] - about) @ place.rotation.T
-    gaps = points.positions - place.apply(about) - arms
-    return normal_equations(gaps, arms, surface.normals[nearest] @ place.rotation.T, width, to_planes)
+    # Where whole distances decide, what is farther off than that does not count.
+    within = np.inf if to_planes else width / place.scale
+    nearest = surface.nearest(inverse.apply(points.positions), inverse.apply(points.viewpoints), within)
+    return normal_equations(
+        points.positions, surface.points, surface.normals, nearest,
+        place.rotation, place.apply(about), place.scale, about, width, to_planes,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(gaps, arms, normals, width, to_planes):
-    """Gauss-Newton's matrix (7, 7) and right side (7,), and Tukey's weights (n,) of the points.
+def first_facing(near, samples, normals, points, viewpoints):
+    """The first (p,) of each point's nearest samples that faces its viewpoint; the very first if none does.
 
     Parameters
     ----------
-    gaps : (n, 3) from the surface to the points.
-    arms : (n, 3) from the surface's centre to its points.
-    normals : (n, 3) there.
-    width : gaps as large do not count.
+    near : (p, k) rows of samples, the nearest first; as many as there are samples, where there are no more.
+    samples, normals : (n, 3).
+    points, viewpoints : (p, 3).
+    """
+    found = np.empty(len(points), np.int64)
+    for p in range(len(points)):
+        found[p] = near[p, 0]
+        for k in range(near.shape[1]):
+            n = near[p, k]
+            facing = 0.0
+            if n < len(samples):
+                for x in range(3):
+                    facing += normals[n, x] * (viewpoints[p, x] - points[p, x])
+            if n == len(samples) or facing > 0.0:
+                found[p] = n
+                break
+    return found
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(positions, samples, normals, nearest, rotation, middle, scale, about, width, to_planes):
+    """Gauss-Newton's matrix (7, 7) and right side (7,), and Tukey's weights (p,) of the points.
+
+    Parameters
+    ----------
+    positions : (p, 3) of the points, world.
+    samples, normals : (n, 3) of the surface, object frame.
+    nearest : (p,) sample of each point; n where it has none and does not count.
+    rotation, scale : (3, 3) and factor of world_from_object.
+    middle, about : (3,) the point about which the step scales and turns, world and object frame.
+    width : points farther from the surface do not count, world unit.
     to_planes : as in `fit_surface`.
     """
-    matrix, right, weights = np.zeros((7, 7)), np.zeros(7), np.zeros(len(gaps))
-    row, axes = np.empty(7), np.eye(3)
-    for p in range(len(gaps)):
-        g, a = gaps[p], arms[p]
-        along = g[0] * normals[p, 0] + g[1] * normals[p, 1] + g[2] * normals[p, 2]
-        square = along**2 if to_planes else g[0] ** 2 + g[1] ** 2 + g[2] ** 2
+    matrix, right, weights = np.zeros((7, 7)), np.zeros(7), np.zeros(len(positions))
+    row, axes, arm, gap, normal = np.empty(7), np.eye(3), np.empty(3), np.empty(3), np.empty(3)
+    for p in range(len(positions)):
+        n = nearest[p]
+        if n == len(samples):
+            continue
+        along = square = 0.0
+        for x in range(3):
+            arm[x] = normal[x] = 0.0
+            for y in range(3):
+                arm[x] += scale * rotation[x, y] * (samples[n, y] - about[y])
+                normal[x] += rotation[x, y] * normals[n, y]
+            gap[x] = positions[p, x] - middle[x] - arm[x]
+            along += gap[x] * normal[x]
+            square += gap[x] ** 2
+        square = along**2 if to_planes else square
         if square >= width**2:
             continue
         weights[p] = (1.0 - square / width**2) ** 2
         for direction in range(1 if to_planes else 3):
-            d = normals[p] if to_planes else axes[direction]
-            row[0] = a[0] * d[0] + a[1] * d[1] + a[2] * d[2]
-            row[1] = a[1] * d[2] - a[2] * d[1]
-            row[2] = a[2] * d[0] - a[0] * d[2]
-            row[3] = a[0] * d[1] - a[1] * d[0]
+            d = normal if to_planes else axes[direction]
+            row[0] = arm[0] * d[0] + arm[1] * d[1] + arm[2] * d[2]
+            row[1] = arm[1] * d[2] - arm[2] * d[1]
+            row[2] = arm[2] * d[0] - arm[0] * d[2]
+            row[3] = arm[0] * d[1] - arm[1] * d[0]
             row[4:] = d
-            measured = along if to_planes else g[direction]
+            measured = along if to_planes else gap[direction]
             for i in range(7):
                 right[i] += weights[p] * row[i] * measured
                 for j in range(7):
@@ -225,9 +265,11 @@ def normal_equations(gaps, arms, normals, width, to_planes):
 
 def _damped_solution(matrix: Array, right: Array, prior: Array) -> Array:
     """The step (7,); what has an infinite prior stays, and no step turns or scales by more than 0.3."""
-    free = np.isfinite(prior)
-    step = np.zeros(7)
-    step[free] = np.linalg.solve(matrix[np.ix_(free, free)] + np.diag(prior[free]), right[free])
+    held = np.isinf(prior)
+    damped, aim = matrix.copy(), right.copy()
+    damped[held], damped[:, held], aim[held] = 0.0, 0.0, 0.0
+    damped.flat[::8] += np.where(held, 1.0, prior)  # the diagonal
+    step = np.linalg.solve(damped, aim)
     step[:4] = np.clip(step[:4], -0.3, 0.3)
     return step
 
