@@ -114,7 +114,8 @@ def a_turn_back(model: ReducedModel, start: State, estimate: Estimate, angles: S
 
     Their range is of two turns: from its middle they may go on either way.
     """
-    ended = estimate.at_bound & [parameter.name in angles for parameter in model.parameters]
+    named = np.array([parameter.name in angles for parameter in model.parameters], dtype=bool)
+    ended = estimate.at_bound & named
     turns = 2.0 * np.pi * np.sign(start.parameters)
     return replace(start, parameters=np.where(ended, start.parameters - turns, start.parameters))
 
