@@ -40,8 +40,7 @@ import morph_dslam as md
 from morph_dslam.extend.geometry import fit_similarity
 from morph_dslam.extend.models import MaterialPoints, SeparatedField, von_mises
 from morph_dslam.extend.registration import run_registration
-from morph_dslam.extend.slam import run_slam
-from morph_dslam.io.camera_files import save_camera
+from morph_dslam.extend.slam import run_slam, save_camera
 from morph_dslam.mechanics.point_location import material_points
 from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.model.reduced_model import spread_over

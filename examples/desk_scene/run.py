@@ -36,9 +36,8 @@ import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.geometry import fit_similarity
 from morph_dslam.extend.registration import draw_registration
-from morph_dslam.extend.slam import Trajectory, load_trajectory, refine_camera
+from morph_dslam.extend.slam import Trajectory, load_trajectory, refine_camera, save_camera
 from morph_dslam.extend.studies import build_rigid
-from morph_dslam.io.camera_files import save_camera
 from support import data_folder
 
 Array = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Tracking and mapping of a rigid scene, frame by frame, beside `morph_dslam.map_scene`."""
 
-from morph_dslam.io.camera_files import load_camera_or_pair as load_camera_or_pair
+from morph_dslam.io.camera_files import load_camera_or_pair as load_camera_or_pair, save_camera as save_camera
 from morph_dslam.io.trajectory import Trajectory as Trajectory, load_trajectory as load_trajectory
 from morph_dslam.slam.result import (
     NoPose as NoPose,

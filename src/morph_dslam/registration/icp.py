@@ -269,7 +269,7 @@ def _damped_solution(matrix: Array, right: Array, prior: Array) -> Array:
     damped, aim = matrix.copy(), right.copy()
     damped[held], damped[:, held], aim[held] = 0.0, 0.0, 0.0
     damped.flat[::8] += np.where(held, 1.0, prior)  # the diagonal
-    step = np.linalg.solve(damped, aim)
+    step = np.asarray(np.linalg.solve(damped, aim), dtype=np.float64)
     step[:4] = np.clip(step[:4], -0.3, 0.3)
     return step
 
