@@ -7,7 +7,7 @@ which a real cube has rounded. `depth_mm`, the median distance of the measured d
 says how far that pose is off itself: the faces that were measured are 6.5 mm nearer.
 
 Where it was found without a hint in a map of all frames, the cube is tracked through them by their colour, and the
-videos are in output/. (Depth in tracking turns it by up to 7 degrees here, see docs/tracking.md.) `still_mm` and
+videos are in output/. (Depth in tracking turns the cube by degrees here, see docs/tracking.md.) `still_mm` and
 `still_deg` are how far it seems to move on the desk while the true path of the camera goes by, mean and largest: the
 path's own errors of a few millimetres are in them.
 
@@ -196,9 +196,9 @@ def track_cube(name: str, scene: md.Scene, placed: md.Registration, frames: Path
     known = dict(zip(np.rint(truth.timestamps * FPS).astype(int).tolist(), truth.world_from_camera, strict=True))
     rows = [row for row in np.flatnonzero(run.tracked).tolist() if int(run.frames[row]) in known]
     cubes = np.array([known[int(run.frames[row])] @ run.camera_from_object[row] for row in rows])
-    turns = Rotation.from_matrix(cubes[:, :3, :3])
+    turns, places = Rotation.from_matrix(cubes[:, :3, :3]), cubes[:, :3, 3]
     angles = np.degrees((turns.mean().inv() * turns).magnitude())
-    return Tracked(name, int(run.tracked.sum()), angles, 1e3 * np.linalg.norm(cubes - cubes.mean(axis=0), axis=1)[:, 3])
+    return Tracked(name, int(run.tracked.sum()), angles, 1e3 * np.linalg.norm(places - places.mean(axis=0), axis=1))
 
 
 def attempt(

@@ -110,10 +110,10 @@ def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sightin
     if given.frames is None:
         raise RegistrationError("landmarks in a map need the numbers of their frames: a first column 'frame'")
     pixels = np.ascontiguousarray(scene.camera.undistort_pixels(given.pixels))
-    sightings = []
+    sightings, poses = [], _camera_poses(scene)
     for frame in np.unique(given.frames).tolist():
         rows = given.frames == frame
-        pose = _camera_in(scene, frame, "landmarks")
+        pose = _camera_in(poses, frame, "landmarks")
         sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(pixels[rows])))
     return tuple(sightings)
 
@@ -125,14 +125,19 @@ def _guessed(path: Path, scene: Scene) -> GuessedPose:
         raise RegistrationError(f"{path}: a guess in a map needs the number of its frame, 'frame = N' above [pose]")
     if given.guess.parameters:
         raise RegistrationError(f"{path}: the object is undeformed in a map: leave out [parameters]")
-    return GuessedPose(given.guess.frame, _camera_in(scene, given.guess.frame, "guess"), given.pose)
+    pose = _camera_in(_camera_poses(scene), given.guess.frame, "guess")
+    return GuessedPose(given.guess.frame, pose, given.pose)
 
 
-def _camera_in(scene: Scene, frame: int, hint: str) -> RigidTransform:
-    """The camera's pose in a frame that a hint names; raises RegistrationError if the map has none."""
+def _camera_poses(scene: Scene) -> dict[int, NDArray[np.float64]]:
+    """camera_from_world (4, 4) by the frames that the map has a pose for."""
     path = scene.trajectory
     poses = {int(k): np.linalg.inv(m) for k, m in zip(path.indices, path.world_from_camera, strict=True)}
-    poses |= {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
+    return poses | {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
+
+
+def _camera_in(poses: dict[int, NDArray[np.float64]], frame: int, hint: str) -> RigidTransform:
+    """The camera's pose in a frame that a hint names; raises RegistrationError if the map has none."""
     if frame not in poses:
         raise RegistrationError(
             f"frame {frame} has no pose in the map, which has frames {min(poses)}-{max(poses)}: set the {hint} "

@@ -202,18 +202,17 @@ class FrameEstimation:
 
     def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
+        if not starts:
+            return attempt
         measurement, prior, state = attempt.measurement, attempt.prior, attempt.estimate.state
         weights, valid = self._noise.weights(measurement.spread, measurement.valid), np.flatnonzero(measurement.valid)
         every = (self._reference.points, measurement.pixels, weights)
         rows = valid[:: 1 + len(valid) // SCOUTED]
         # So many times the weight, lest a prior count for more among few.
         few = (every[0].take(rows), every[1][rows], weights[rows] * (len(valid) / max(len(rows), 1)))
-        found = [self._scout.minimum(*few, start, prior=prior) for start in starts]
-        best = min(found, key=lambda other: other.cost, default=None)
+        best = min((self._scout.minimum(*few, start, prior=prior) for start in starts), key=lambda other: other.cost)
         for points in (few, every):
-            if best is None or self._cost(points, best.state, prior) > CLEARLY_BETTER * self._cost(
-                points, state, prior
-            ):
+            if self._cost(points, best.state, prior) > CLEARLY_BETTER * self._cost(points, state, prior):
                 return attempt
         return self._trimmed(measurement, best.state, prior)
 
