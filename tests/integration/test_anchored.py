@@ -246,6 +246,19 @@ def test_a_live_run_keeps_the_pace_and_everything_it_found(recording, tmp_path):
     capture.release()
 
 
+@pytest.mark.parametrize("shown", [[0, 10, 20], [0, 12, 13, 14, 20]])
+def test_a_free_object_that_jumps_without_a_gap_is_found_by_its_features(recording, tmp_path, shown):
+    """Followed at the last velocity, few points would agree in the last of these frames, several millimetres off."""
+    folder, truth = recording
+    known = {"landmarks": folder / "sequence" / "landmarks.csv", "registration": None, "first": None}
+    sheet = OneObject(folder, **known)
+    frames = frames_of(folder, 0, 20)
+    found = [sheet.tracker.track(frames[number].image) for number in shown]
+    assert all(result.status == "tracked" for result in found)
+    apart = found[-1].pose.translation - truth["camera_from_object"][20][:3, 3]
+    assert np.linalg.norm(apart) < 0.5e-3
+
+
 def test_a_free_object_starts_live_from_landmarks_in_the_first_frame(recording, tmp_path):
     folder, truth = recording
     start = {"landmarks": folder / "sequence" / "landmarks.csv", "registration": None}

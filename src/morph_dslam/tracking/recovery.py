@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 #: pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not, nor
 #: do windows that see the rim of what is before the object.
 CLOSE_PX, CLOSE_TO_USUAL = 0.25, 1.5
+#: An object that was followed is lost where fewer than half of its points agree, and these by more than this, pixels,
+#: and than so many times the usual spread.
+LOOSE_PX, LOOSE_TO_USUAL = 1.0, 10.0
 #: Something is before the object where less than this share of the points that it does not hide itself agree.
 UNHIDDEN = 0.75
 #: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
@@ -84,8 +87,15 @@ class Recovery:
             return rejection
         if self.most_agree(attempt) or self._agrees_closely(attempt):
             return None
-        visible, count = attempt.counts
-        return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
+        return _loose(attempt)
+
+    def reject_followed(self, attempt: PoseHypothesis) -> Rejection | None:
+        """Why an object that was followed from the frame before is not accepted; None when it is."""
+        rejection = reject(attempt, self._options)
+        if rejection is not None or attempt.prior is not None or attempt.outline_alone or self.most_agree(attempt):
+            return rejection
+        loose = max(LOOSE_PX, LOOSE_TO_USUAL * np.nan_to_num(self._usual_px))
+        return _loose(attempt) if attempt.estimate.sigma_px > loose else None
 
     def most_agree(self, attempt: PoseHypothesis) -> bool:
         """Whether half of all points agree."""
@@ -119,6 +129,21 @@ class Recovery:
             counts = int(found.inliers.sum()), int(other.inliers.sum())
             return None, replace(rejection, then=Rejection(RejectionReason.TWO_PLACES, *counts))
         return found, None
+
+    def may_have_jumped(self, followed: PoseHypothesis) -> bool:
+        """Whether fewer than half of the points agree of an object that is followed freely, and in doubt."""
+        free = followed.prior is None and not followed.outline_alone
+        return free and not self.most_agree(followed) and self.doubt(followed) > 0.0
+
+    def better(self, picture: Image, followed: PoseHypothesis, last_shape: Array) -> PoseHypothesis | None:
+        """The object where its features are, if most of its points agree there, and more closely than ``followed``.
+
+        None where another one like it is in the frame, too.
+        """
+        found, _ = self._find(picture, self._shapes(last_shape), None)
+        if found is None or not self.most_agree(found) or found.estimate.sigma_px >= followed.estimate.sigma_px:
+            return None
+        return found if self.another(picture, found) is None else None
 
     def another(self, picture: Image, found: PoseHypothesis) -> PoseHypothesis | None:
         """Another one like the object that was found, elsewhere in the frame; None if there is none."""
@@ -170,3 +195,8 @@ class Recovery:
                 shape[k] = lower[k] + share * (upper[k] - lower[k])
                 shapes.append(shape)
         return shapes
+
+
+def _loose(attempt: PoseHypothesis) -> Rejection:
+    visible, count = attempt.counts
+    return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)

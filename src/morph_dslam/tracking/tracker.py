@@ -151,7 +151,7 @@ class Tracker:
         self._still: Prior | None = None
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
-        self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
+        self._lost, self._n_lost, self._n_doubted, self._gaps = not in_sequence, 0, 0, FrameGaps()
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
         self._jumps_before: tuple[DisplacementJump, ...] = ()
@@ -189,6 +189,8 @@ class Tracker:
             found_by, rejection = self._gate(hypothesis)
             if rejection is not None:
                 hypothesis, found_by, rejection = self._relocalize(image, hypothesis, rejection, camera)
+            elif found_by is FoundBy.FLOW:
+                hypothesis, found_by = self._reconsider(image, hypothesis)
             if rejection is None:
                 hypothesis = self._refine(image, hypothesis, camera)
             self._update(image, hypothesis, rejection, camera)
@@ -303,7 +305,7 @@ class Tracker:
             return FoundBy.LAST_STATE, self._view.recovery.reject(hypothesis)
         if self._lost:
             return FoundBy.LAST_STATE, reject(hypothesis, self.options)
-        return FoundBy.FLOW, reject(hypothesis, self.options)
+        return FoundBy.FLOW, self._view.recovery.reject_followed(hypothesis)
 
     def _relocalize(
         self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection, camera: CameraLocalization
@@ -315,6 +317,15 @@ class Tracker:
             return hypothesis, FoundBy.FEATURES, rejection
         found, why = self._view.recovery.recover(image, self._last.parameters, rejection)
         return hypothesis if found is None else found, FoundBy.FEATURES, why
+
+    def _reconsider(self, image: Image, hypothesis: PoseHypothesis) -> tuple[PoseHypothesis, FoundBy]:
+        """Where few of the points that were followed agree, look for features, too: the object may have jumped."""
+        recovery = self._view.recovery
+        self._n_doubted = self._n_doubted + 1 if recovery.may_have_jumped(hypothesis) else 0
+        if self._n_doubted == 0 or (self._n_doubted - 1) % self.options.look_every:
+            return hypothesis, FoundBy.FLOW
+        found = recovery.better(image, hypothesis, self._last.parameters)
+        return (hypothesis, FoundBy.FLOW) if found is None else (found, FoundBy.FEATURES)
 
     def _refine(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
         """Add outline, depth, what earlier frames tell of per-sequence parameters, and the discrepancy."""
