@@ -25,6 +25,7 @@ from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.registration.dense_points import PointsOnSurface
 from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
 from morph_dslam.registration.scene import View, camera_from_object
+from morph_dslam.registration.simplified import simplified
 from morph_dslam.render.rasteriser import draw_depth, image_region
 
 Array = NDArray[np.float64]
@@ -80,6 +81,8 @@ class MeshEdges:
 
     def __init__(self, nodes: Array, triangles: NDArray[np.int64]) -> None:
         self.nodes, self.triangles = nodes, triangles
+        #: Nodes and triangles that are drawn, to see what is hidden.
+        self.drawn = simplified(nodes, triangles)
         self.size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
         sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         owner = np.repeat(np.arange(len(triangles)), 3)
@@ -134,7 +137,7 @@ class MeshEdges:
 
     def _drawn(self, pose: RigidTransform, camera: Camera, shrink: int) -> tuple[NDArray[np.float32], int, int]:
         """The depth of `depth` where the object is, and the region's left and top."""
-        nodes = pose.apply(self.nodes)
+        nodes, triangles = pose.apply(self.drawn[0]), self.drawn[1]
         pixels = (camera.project(nodes) + 0.5) / shrink - 0.5
         region = image_region(pixels, camera.height // shrink, camera.width // shrink)
         if region is None or nodes[:, 2].min() <= 0.0:
@@ -143,7 +146,7 @@ class MeshEdges:
         size = region[0].stop - top, region[1].stop - left
         pixels -= [left, top]
         return (
-            draw_depth(np.ascontiguousarray(pixels), nodes[:, 2].copy(), self.triangles, self._closed, *size)[1],
+            draw_depth(np.ascontiguousarray(pixels), nodes[:, 2].copy(), triangles, self._closed, *size)[1],
             left,
             top,
         )

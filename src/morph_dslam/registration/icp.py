@@ -61,15 +61,14 @@ class Surface:
         """Nearest-point search."""
         return KDTree(self.points, leafsize=20)  # a quarter faster than with ten
 
-    def nearest(self, points: Array, viewpoints: Array, within: float = np.inf) -> NDArray[np.int64]:
+    def nearest(self, points: Array, viewpoints: Array) -> NDArray[np.int64]:
         """The nearest sample (p,) to each point (p, 3) that faces its viewpoint (p, 3), object frame.
 
-        On a thin wall the nearest sample may be on the other side. Open surfaces are seen from both sides. Where there
-        is none ``within`` a distance, metres, it is one more than the last.
+        On a thin wall the nearest sample may be on the other side. Open surfaces are seen from both sides.
         """
         if not self.closed:
-            return np.asarray(self.tree.query(points, distance_upper_bound=within)[1], dtype=np.int64)
-        _, near = self.tree.query(points, k=self._n_neighbours, distance_upper_bound=within)
+            return np.asarray(self.tree.query(points)[1], dtype=np.int64)
+        _, near = self.tree.query(points, k=self._n_neighbours)
         return first_facing(near, self.points, self.normals, points, viewpoints)
 
     @cached_property
@@ -125,16 +124,12 @@ class Surface:
 
 
 def fit_surface(
-    points: MapPoints,
-    surface: Surface,
-    start: SimilarityTransform,
-    widths: Array,
-    metric: bool = False,
-    to_planes: bool = True,
+    points: MapPoints, surface: Surface, start: SimilarityTransform, widths: Array, metric: bool = False
 ) -> tuple[SimilarityTransform, Array]:
-    """Gauss-Newton on distances to the nearest points of the surface, with Tukey's biweight.
+    """Gauss-Newton on distances from the planes at the nearest points of the surface, with Tukey's biweight.
 
-    Distances are measured in the world, where shrinking the surface does not make them smaller.
+    It converges fast from near; from far, `surface_search.laid` is the safer guide. Distances are measured in the
+    world, where shrinking the surface does not make them smaller.
 
     Parameters
     ----------
@@ -143,8 +138,6 @@ def fit_surface(
     start : world_from_object.
     widths : (k,) one iteration each: points farther from the surface than this do not count, world unit.
     metric : keep the scale of ``start``, for maps that have one.
-    to_planes : measure along normals only, which converges fast from near; from far, on a surface with folds,
-        whole distances are the safer guide.
 
     Returns
     -------
@@ -152,22 +145,19 @@ def fit_surface(
     """
     transform = start
     for width in widths:
-        matrix, right, weights = surface_equations(points, surface, transform, surface.centre, width, to_planes)
-        centre = transform.apply(surface.centre)
-        size = surface.radius * transform.scale
-        prior = PRIOR * max(weights.sum(), 1.0) * np.array([size**2] * 4 + [1.0] * 3)
-        if metric:
-            prior[0] = np.inf
-        step = _damped_solution(matrix, right, prior)
+        matrix, right, weights = surface_equations(points, surface, transform, surface.centre, width)
+        prior = step_prior(weights.sum(), surface.radius * transform.scale, metric)
+        step = damped_step(matrix, right, prior)
+        middle = transform.apply(surface.centre)
         scale = transform.scale * float(np.exp(step[0]))
         rotation = rotation_exp(step[1:4]) @ transform.rotation
-        translation = centre + step[4:] - scale * rotation @ surface.centre
+        translation = middle + step[4:] - scale * rotation @ surface.centre
         transform = SimilarityTransform(scale, rotation, translation)
     return transform, weights
 
 
 def surface_equations(
-    points: MapPoints, surface: Surface, place: SimilarityTransform, about: Array, width: float, to_planes: bool = True
+    points: MapPoints, surface: Surface, place: SimilarityTransform, about: Array, width: float
 ) -> tuple[Array, Array, Array]:
     """Gauss-Newton's matrix (7, 7) and right side (7,) of points on a surface, and their weights (n,), 0 to 1.
 
@@ -178,15 +168,12 @@ def surface_equations(
     place : world_from_object.
     about : (3,) the point, object frame, about which the similarity's step scales and turns.
     width : points farther from the surface than this do not count, world unit.
-    to_planes : as of `fit_surface`.
     """
     inverse = place.inverse
-    # Where whole distances decide, what is farther off than that does not count.
-    within = np.inf if to_planes else width / place.scale
-    nearest = surface.nearest(inverse.apply(points.positions), inverse.apply(points.viewpoints), within)
+    nearest = surface.nearest(inverse.apply(points.positions), inverse.apply(points.viewpoints))
     return normal_equations(
         points.positions, surface.points, surface.normals, nearest,
-        place.rotation, place.apply(about), place.scale, about, width, to_planes,
+        place.rotation, place.apply(about), place.scale, about, width, True,
     )  # fmt: skip
 
 
@@ -196,7 +183,7 @@ def first_facing(near, samples, normals, points, viewpoints):
 
     Parameters
     ----------
-    near : (p, k) rows of samples, the nearest first; as many as there are samples, where there are no more.
+    near : (p, k) rows of samples, the nearest first.
     samples, normals : (n, 3).
     points, viewpoints : (p, 3).
     """
@@ -206,10 +193,9 @@ def first_facing(near, samples, normals, points, viewpoints):
         for k in range(near.shape[1]):
             n = near[p, k]
             facing = 0.0
-            if n < len(samples):
-                for x in range(3):
-                    facing += normals[n, x] * (viewpoints[p, x] - points[p, x])
-            if n == len(samples) or facing > 0.0:
+            for x in range(3):
+                facing += normals[n, x] * (viewpoints[p, x] - points[p, x])
+            if facing > 0.0:
                 found[p] = n
                 break
     return found
@@ -223,18 +209,16 @@ def normal_equations(positions, samples, normals, nearest, rotation, middle, sca
     ----------
     positions : (p, 3) of the points, world.
     samples, normals : (n, 3) of the surface, object frame.
-    nearest : (p,) sample of each point; n where it has none and does not count.
+    nearest : (p,) sample of each point.
     rotation, scale : (3, 3) and factor of world_from_object.
     middle, about : (3,) the point about which the step scales and turns, world and object frame.
     width : points farther from the surface do not count, world unit.
-    to_planes : as in `fit_surface`.
+    to_planes : whether distances are measured along the samples' normals only.
     """
     matrix, right, weights = np.zeros((7, 7)), np.zeros(7), np.zeros(len(positions))
     row, axes, arm, gap, normal = np.empty(7), np.eye(3), np.empty(3), np.empty(3), np.empty(3)
     for p in range(len(positions)):
         n = nearest[p]
-        if n == len(samples):
-            continue
         along = square = 0.0
         for x in range(3):
             arm[x] = normal[x] = 0.0
@@ -263,25 +247,48 @@ def normal_equations(positions, samples, normals, nearest, rotation, middle, sca
     return matrix, right, weights
 
 
-def _damped_solution(matrix: Array, right: Array, prior: Array) -> Array:
-    """The step (7,); what has an infinite prior stays, and no step turns or scales by more than 0.3."""
-    held = np.isinf(prior)
+@njit(cache=True, nogil=True)
+def step_prior(weight, size, metric):
+    """Weights (7,) of staying in directions that points of a total ``weight`` leave open.
+
+    Parameters
+    ----------
+    weight : of all points.
+    size : of the surface, world unit.
+    metric : whether the scale stays: its weight is infinite.
+    """
+    prior = np.full(7, PRIOR * max(weight, 1.0))
+    prior[:4] *= size**2
+    if metric:
+        prior[0] = np.inf
+    return prior
+
+
+@njit(cache=True, nogil=True)
+def damped_step(matrix, right, prior):
+    """The step (7,) of equations (7, 7) and (7,), at most 0.3 in scale and turns; what has an infinite prior stays."""
     damped, aim = matrix.copy(), right.copy()
-    damped[held], damped[:, held], aim[held] = 0.0, 0.0, 0.0
-    damped.flat[::8] += np.where(held, 1.0, prior)  # the diagonal
-    step = np.asarray(np.linalg.solve(damped, aim), dtype=np.float64)
-    step[:4] = np.clip(step[:4], -0.3, 0.3)
+    for i in range(7):
+        if np.isinf(prior[i]):
+            damped[i, :], damped[:, i], aim[i], damped[i, i] = 0.0, 0.0, 0.0, 1.0
+        else:
+            damped[i, i] += prior[i]
+    step = np.linalg.solve(damped, aim)
+    for i in range(4):
+        step[i] = min(max(step[i], -0.3), 0.3)
     return step
 
 
-#: Two places are one if the surfaces are this near to each other, over their size.
-SAME_PLACE = 0.05
+#: Two places are one if the surfaces are this near to each other, over their size. Then their middles are so, too.
+SAME_PLACE, SAME_MIDDLE = 0.05, 0.4
 
 
 def same_place(a: SimilarityTransform, b: SimilarityTransform, surface: Surface) -> bool:
     """Whether two similarities lay the surface, as a set of points, in the same place."""
     between = b.inverse @ a
     if not abs(np.log(between.scale)) < 0.1:
+        return False
+    if np.linalg.norm(between.apply(surface.centre) - surface.centre) > SAME_MIDDLE * surface.size:
         return False
     distances, _ = surface.tree.query(between.apply(surface.points[::20]))
     return float(distances.mean()) < SAME_PLACE * surface.size

@@ -36,6 +36,7 @@ from morph_dslam.registration.point_evidence import PointEvidence, gather_eviden
 from morph_dslam.registration.registration import Axis, Rival
 from morph_dslam.registration.scene import MapPoints, View, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
+from morph_dslam.registration.surface_search import laid
 from morph_dslam.registration.texture import TextureComparison
 from morph_dslam.registration.view_registration import (
     NO_HINTS,
@@ -54,8 +55,8 @@ START_BEHIND = (0.0, 0.6)
 #: Points used while searching; starts of a region that are followed to their end, scored by few keyframes,
 #: and refined and scored by more.
 MOST_POINTS, N_FOLLOWED, N_SCORED, N_REFINED = 120, 120, 40, 5
-#: Samples of the surface while searching, and keyframes asked for evidence, first and then.
-ROUGH_SAMPLES, FIRST_ASKED, MOST_ASKED = 3000, 3, 10
+#: Samples of the surface for all starts and for the better ones; keyframes asked for evidence, first and then.
+ROUGH_SAMPLES, FIRST_ASKED, MOST_ASKED = (600, 1500), 3, 10
 #: Widths of the robust weights over the surface's size: for all starts, for the better ones, to refine these.
 COARSE = np.array([0.3, 0.25, 0.2, 0.15])
 MIDDLE = np.array([0.15, 0.12, 0.1, 0.08, 0.07, 0.06, 0.05])
@@ -257,20 +258,20 @@ def _by_points(
 ) -> MeshRegistration:
     """The object found by the points of the map alone; parameters as of `register_mesh`."""
     surface, nodes, triangles, camera = search.surface, search.edges.nodes, search.edges.triangles, search.camera
-    rough = Surface.of_mesh(nodes, triangles, ROUGH_SAMPLES)
+    rougher, rough = (Surface.of_mesh(nodes, triangles, count) for count in ROUGH_SAMPLES)
     planes = find_planes(points.positions)
     starts_in = attitudes(surface.axis_of_revolution, planes.largest_normal(points.positions))
 
     def judged(place: SimilarityTransform, asked: Sequence[View]) -> _Place:
         tolerance = TOLERANCE * surface.size * place.scale
-        return _Place(place, gather_evidence(place, nodes, triangles, points.positions, asked, camera, tolerance))
+        return _Place(place, gather_evidence(place, *search.edges.drawn, points.positions, asked, camera, tolerance))
 
     places: list[_Place] = []
     few, more = spread_views(views, FIRST_ASKED), spread_views(views, MOST_ASKED)
     for region in tqdm(
         candidate_regions(points.positions, planes), desc="registering", unit="region", disable=not progress
     ):
-        starts = [judged(place, few) for place in _searched(points[region], rough, starts_in, metric)]
+        starts = [judged(place, few) for place in _searched(points[region], rougher, rough, starts_in, metric)]
         for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
             places.append(judged(_refined(start.transform, points, surface, metric), more))
     candidates = _distinct(places, len(points), surface)
@@ -308,32 +309,26 @@ def _refined(start: SimilarityTransform, points: MapPoints, surface: Surface, me
     return fit_surface(points[near], surface, start, FINE * size, metric)[0]
 
 
-def _searched(points: MapPoints, surface: Surface, starts_in: list[Array], metric: bool) -> list[SimilarityTransform]:
+def _searched(
+    points: MapPoints, rougher: Surface, rough: Surface, starts_in: list[Array], metric: bool
+) -> list[SimilarityTransform]:
     """The best distinct fits to a region, before the keyframes have been asked."""
     some = points[np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]]
     centre = np.median(points.positions, axis=0)
     spread = float(np.sqrt(np.mean(np.sum((points.positions - centre) ** 2, axis=1))))
     away = centre - points.viewpoints.mean(axis=0)
     away *= spread / np.linalg.norm(away)
-    starts = []
-    for scale in (1.0,) if metric else np.array(START_SIZES) * spread / surface.radius:
-        for rotation, behind in product(starts_in, START_BEHIND):
-            place = centre + behind * away - scale * rotation @ surface.centre
-            start = SimilarityTransform(scale, rotation, place)
-            starts.append(fit_surface(some, surface, start, COARSE * surface.size * scale, metric, False))
-    fits = []
-    for begun in _by_weight(starts)[:N_FOLLOWED]:
-        fits.append(fit_surface(some, surface, begun, MIDDLE * surface.size * begun.scale, metric, False))
+    starts = [
+        SimilarityTransform(scale, rotation, centre + behind * away - scale * rotation @ rougher.centre)
+        for scale in ((1.0,) if metric else (np.array(START_SIZES) * spread / rougher.radius).tolist())
+        for rotation, behind in product(starts_in, START_BEHIND)
+    ]
+    begun = laid(some, rougher, starts, COARSE, metric)[:N_FOLLOWED]
     chosen: list[SimilarityTransform] = []
-    for place in _by_weight(fits):
-        if len(chosen) < N_SCORED and all(not same_place(place, other, surface) for other in chosen):
+    for place in laid(some, rough, begun, MIDDLE, metric):
+        if len(chosen) < N_SCORED and all(not same_place(place, other, rough) for other in chosen):
             chosen.append(place)
     return chosen
-
-
-def _by_weight(fits: list[tuple[SimilarityTransform, Array]]) -> list[SimilarityTransform]:
-    """The fits without their weights, those of most weight first."""
-    return [transform for transform, _ in sorted(fits, key=lambda fit: -float(fit[1].sum()))]
 
 
 def _distinct(places: list[_Place], n_points: int, surface: Surface) -> list[_Place]:

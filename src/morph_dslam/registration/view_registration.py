@@ -273,7 +273,7 @@ class EdgeSearch:
         return self._points_in(place, views_of(self.edges.nodes, place, self._dense[1], self.camera, most))
 
     def _points_in(self, place: SimilarityTransform, views: Sequence[View]) -> PointEvidence:
-        nodes, triangles = self.edges.nodes, self.edges.triangles
+        nodes, triangles = self.edges.drawn
         tolerance = TOLERANCE * self.edges.size * place.scale
         positions = self._dense[0].positions
         return gather_evidence(place, nodes, triangles, positions, views, self.camera, tolerance, DEPTH_NOISE)
