@@ -37,7 +37,7 @@ from morph_dslam.registration.registration import Axis, Rival
 from morph_dslam.registration.scene import MapPoints, View, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.surface_search import laid
-from morph_dslam.registration.texture import TextureComparison
+from morph_dslam.registration.texture import Agreement, TextureComparison
 from morph_dslam.registration.view_registration import (
     NO_HINTS,
     TELLING_CHANCE,
@@ -70,9 +70,9 @@ MOST_RIVALS = 3
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
-#: does not put there, or no less than the keyframes leave open by so many standard deviations of that share (one-sided,
-#: 5 %); where landmarks have it, by the outline alone. Its images are believed before its edges unless
-#: they lose more than this part of the score.
+#: does not put there (`AGAINST`, where the images on its surface show its shape), or no less than the keyframes
+#: leave open by so many standard deviations of that share (one-sided, 5 %); where landmarks have it, by the outline
+#: alone. Its images are believed before its edges unless they lose more than this part of the score.
 CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST = 10.0, 0.5, 1.645, 5.0
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
@@ -102,6 +102,7 @@ class MeshRegistration:
     unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
         wall, say, that have its shape in another size.
     edges : how much of its edges the keyframes show, if it was found by these or they contradict the points.
+    shape_shown : whether the images agree on the surface as they would on no flat one.
     """
 
     world_from_object: SimilarityTransform
@@ -115,6 +116,7 @@ class MeshRegistration:
     outline: OutlineFit = field(default_factory=OutlineFit)
     unconfirmed: bool = False
     edges: EdgeEvidence | None = None
+    shape_shown: bool = False
 
     @property
     def runner_up(self) -> float:
@@ -140,7 +142,8 @@ class MeshRegistration:
     @property
     def _lacks_edges(self) -> bool:
         """Whether the keyframes show too little of its outline, beyond what they are apart on it."""
-        return self.edges is not None and self.edges.gain + ONE_SIDED * self.edges.gain_std < OUTLINE_SHOWN
+        enough = AGAINST if self.shape_shown else OUTLINE_SHOWN
+        return self.edges is not None and self.edges.gain + ONE_SIDED * self.edges.gain_std < enough
 
     @property
     def ambiguous(self) -> bool:
@@ -240,11 +243,14 @@ def _by_edges(
         edges=best.edges,
     )
     aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, metric)
-    if aligned is None or aligned[1] > POOR_AGREEMENT_PX:
+    if aligned is None or aligned.rms_px > POOR_AGREEMENT_PX:
         return found
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
     adjusted = _adjusted(
-        replace(found, world_from_object=aligned[0], rms_px=aligned[1]), adjustment, nodes.mean(axis=0), metric
+        replace(found, world_from_object=aligned.place, rms_px=aligned.rms_px, shape_shown=aligned.shows_its_shape),
+        adjustment,
+        nodes.mean(axis=0),
+        metric,
     )
     there = search.at(adjusted.world_from_object)
     if adjusted.keyframes is None or 100.0 * there.rank < score - LOST:
@@ -365,13 +371,11 @@ def _worth_comparing(candidates: list[_Place]) -> list[_Place]:
     return [place for place in candidates[:N_COMPARED] if place.evidence.score >= least]
 
 
-def _chosen(
-    candidates: list[_Place], aligned: list[tuple[SimilarityTransform, float] | None], surface: Surface
-) -> MeshRegistration:
+def _chosen(candidates: list[_Place], aligned: list[Agreement | None], surface: Surface) -> MeshRegistration:
     """The candidate on which the images agree best; ``aligned`` are the first ones, refined by images."""
     compared = candidates[: len(aligned)]
-    moved = [place.transform if found is None else found[0] for place, found in zip(compared, aligned, strict=True)]
-    misfits = np.array([np.inf if found is None else found[1] for found in aligned])
+    moved = [place.transform if found is None else found.place for place, found in zip(compared, aligned, strict=True)]
+    misfits = np.array([np.inf if found is None else found.rms_px for found in aligned])
     row = int(np.argmin(misfits))  # the first where no images can be compared
     best, place = compared[row].evidence, moved[row]
     others = [Rival(other.transform, other.evidence.score) for other in candidates[len(compared) :]]

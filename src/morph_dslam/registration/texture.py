@@ -41,6 +41,9 @@ REFINEMENTS, MOST_VIEWS = 6, 8
 HUBER_PX = 0.5
 #: Fewer measurements are no evidence.
 FEWEST = 60
+#: Images show a surface's shape if this share of the points looks alike, and a plane would misplace them by so many
+#: times what they are off.
+MOST_ALIKE, CLEAR_RELIEF = 0.9, 10.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class PairDisplacements:
     offsets : (p, 2) from where the second view should show the points to where it does, pixels.
     by_first : (p, 2, 6) how the expected pixel moves with the first pose (`pose_jacobian`).
     by_second : (p, 2, 6) likewise with the second one.
+    by_depth : (p,) pixels by which it moves with the point's depth in the first view, a metre.
+    n_compared : points that both views see, whether they look alike or not.
     """
 
     first: int
@@ -63,6 +68,32 @@ class PairDisplacements:
     offsets: Array
     by_first: Array
     by_second: Array
+    by_depth: Array
+    n_compared: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far images of a surface agree.
+
+    Attributes
+    ----------
+    place : world_from_object with which they do.
+    rms_px : root mean square misfit of a pixel coordinate.
+    share : of the points that two views see, those that look alike in both.
+    relief_px : root mean square by which the points that look alike would be misplaced in the second view, were the
+        surface the plane nearest to them.
+    """
+
+    place: SimilarityTransform
+    rms_px: float
+    share: float
+    relief_px: float
+
+    @property
+    def shows_its_shape(self) -> bool:
+        """Whether nearly all that is seen of the surface agrees, and no flat one would."""
+        return self.share >= MOST_ALIKE and self.relief_px >= CLEAR_RELIEF * self.rms_px
 
 
 @dataclass(frozen=True)
@@ -91,9 +122,7 @@ class TextureComparison:
         self._nodes, self._triangles, self._camera = nodes, triangles, camera
         self._centre = nodes.mean(axis=0)
 
-    def refine(
-        self, start: SimilarityTransform, views: Sequence[View], metric: bool = False
-    ) -> tuple[SimilarityTransform, float] | None:
+    def refine(self, start: SimilarityTransform, views: Sequence[View], metric: bool = False) -> Agreement | None:
         """The world_from_object near ``start`` with which all views agree.
 
         Parameters
@@ -102,13 +131,10 @@ class TextureComparison:
         views : keyframes of the map.
         metric : keep the scale.
 
-        Returns
-        -------
-        The similarity and the root mean square misfit of a pixel coordinate; None where too little can be
-        compared.
+        None where too little can be compared.
         """
         views = views_of(self._nodes, start, views, self._camera, MOST_VIEWS)
-        images, transform, rms = [view.normalized for view in views], start, 0.0
+        images, transform, rms, measured = [view.normalized for view in views], start, 0.0, []
         for _ in range(REFINEMENTS):
             poses = [camera_from_object(view, transform) for view in views]
             measured = self.measure(images, poses)
@@ -116,7 +142,8 @@ class TextureComparison:
                 return None
             step, rms = self._step(measured, poses, transform, metric)
             transform = moved_similarity(transform, step, self._centre)
-        return transform, rms
+        share = sum(len(pair.offsets) for pair in measured) / sum(pair.n_compared for pair in measured)
+        return Agreement(transform, rms, share, _relief(measured))
 
     def _step(
         self,
@@ -195,6 +222,8 @@ class TextureComparison:
             moves[found],
             projected @ (between.rotation @ slide @ pose_jacobian(points[rows], first.pose)),
             projected @ pose_jacobian(seen[rows], second.pose),
+            np.linalg.norm(np.einsum("pij,pj->pi", projected, rays[rows] @ between.rotation.T), axis=1),
+            int(kept.sum()),
         )
 
     def _on_surface(self, drawn: _Drawn) -> tuple[Array, Array, Array, Array]:
@@ -234,6 +263,15 @@ class TextureComparison:
         )
         moves, alike = align_patches(carried, shown, second.normalized, expected, WINDOW // 2)
         return moves, alike >= LEAST_CORRELATION
+
+
+def _relief(measured: Sequence[PairDisplacements]) -> float:
+    """As `Agreement.relief_px`."""
+    places = np.concatenate([pair.places for pair in measured])
+    off = places - places.mean(axis=0)
+    _, vectors = np.linalg.eigh(off.T @ off)
+    moved = (off @ vectors[:, 0]) * np.concatenate([pair.by_depth for pair in measured])
+    return float(np.sqrt(np.mean(moved**2)))
 
 
 def _corners(normalized: Image, buffers: Buffers) -> Array:
