@@ -16,7 +16,17 @@ from typing import Any
 
 HELP = "check this computer: versions, cores, cameras, videos, extras, and a self-test"
 KEPT = "nothing was written"
-PACKAGES = ("numpy", "scipy", "numba", "ngsolve", "opencv-python-headless", "h5py", "meshio", "trimesh")
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "ngsolve",
+    "opencv-python-headless",
+    "h5py",
+    "meshio",
+    "trimesh",
+    "fast-simplification",
+)
 #: What an extra of the package brings, by a module of it.
 EXTRAS = {
     "studio": ("starlette", "the studio in the browser"),
