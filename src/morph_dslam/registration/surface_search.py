@@ -39,9 +39,8 @@ def laid(
     metric : keep the scales of the starts.
     """
     scales = np.array([start.scale for start in starts])
-    rotations, translations = (
-        np.array([getattr(start, name) for start in starts]) for name in ("rotation", "translation")
-    )
+    rotations = np.array([start.rotation for start in starts])
+    translations = np.array([start.translation for start in starts])
     weights = np.zeros(len(starts))
 
     def lay(part: NDArray[np.int64]) -> None:

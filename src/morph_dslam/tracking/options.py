@@ -45,7 +45,7 @@ class TrackerOptions:
         the registration's pose is that of every frame (`track` estimates it from all of them).
     moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
         off than this share of its size, and than so many standard deviations, in so many frames on end.
-    look_every : a hidden object is looked for elsewhere in every so many frames.
+    look_every : a hidden or doubted object is looked for elsewhere in every so many frames.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from. An object
         with too little texture is followed by it alone.
     use_texture : whether texture counts where the outline does.

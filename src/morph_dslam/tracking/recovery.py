@@ -48,7 +48,7 @@ class Recovery:
     ) -> None:
         self._model, self._reference, self._camera = model, reference, camera
         self._estimation, self._options = estimation, options
-        self._usual_px = np.nan
+        self._usual_px, self._n_doubted = np.nan, 0
 
     def learn(self, attempt: PoseHypothesis) -> None:
         """Take in how closely the points agreed in a frame in which the object was followed."""
@@ -130,16 +130,17 @@ class Recovery:
             return None, replace(rejection, then=Rejection(RejectionReason.TWO_PLACES, *counts))
         return found, None
 
-    def may_have_jumped(self, followed: PoseHypothesis) -> bool:
-        """Whether fewer than half of the points agree of an object that is followed freely, and in doubt."""
-        free = followed.prior is None and not followed.outline_alone
-        return free and not self.most_agree(followed) and self.doubt(followed) > 0.0
-
-    def better(self, picture: Image, followed: PoseHypothesis, last_shape: Array) -> PoseHypothesis | None:
+    def jumped_to(self, picture: Image, followed: PoseHypothesis, last_shape: Array) -> PoseHypothesis | None:
         """The object where its features are, if most of its points agree there, and more closely than ``followed``.
 
-        None where another one like it is in the frame, too.
+        It is looked for where fewer than half of the points agree of an object that is followed freely, and in doubt:
+        in the first of such frames and now and then. None where there is another one like it in the frame, too.
         """
+        free = followed.prior is None and not followed.outline_alone
+        doubted = free and not self.most_agree(followed) and self.doubt(followed) > 0.0
+        self._n_doubted = self._n_doubted + 1 if doubted else 0
+        if not doubted or (self._n_doubted - 1) % self._options.look_every:
+            return None
         found, _ = self._find(picture, self._shapes(last_shape), None)
         if found is None or not self.most_agree(found) or found.estimate.sigma_px >= followed.estimate.sigma_px:
             return None

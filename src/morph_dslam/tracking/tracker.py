@@ -151,7 +151,7 @@ class Tracker:
         self._still: Prior | None = None
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
-        self._lost, self._n_lost, self._n_doubted, self._gaps = not in_sequence, 0, 0, FrameGaps()
+        self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
         self._jumps_before: tuple[DisplacementJump, ...] = ()
@@ -320,11 +320,7 @@ class Tracker:
 
     def _reconsider(self, image: Image, hypothesis: PoseHypothesis) -> tuple[PoseHypothesis, FoundBy]:
         """Where few of the points that were followed agree, look for features, too: the object may have jumped."""
-        recovery = self._view.recovery
-        self._n_doubted = self._n_doubted + 1 if recovery.may_have_jumped(hypothesis) else 0
-        if self._n_doubted == 0 or (self._n_doubted - 1) % self.options.look_every:
-            return hypothesis, FoundBy.FLOW
-        found = recovery.better(image, hypothesis, self._last.parameters)
+        found = self._view.recovery.jumped_to(image, hypothesis, self._last.parameters)
         return (hypothesis, FoundBy.FLOW) if found is None else (found, FoundBy.FEATURES)
 
     def _refine(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
