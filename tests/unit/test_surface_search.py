@@ -47,11 +47,10 @@ def test_of_a_thin_wall_the_side_that_was_seen_counts():
     wall = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]])
     normals = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     point, above, below = np.array([[0.0, 0.0, 4e-4]]), np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]])
-    nearest = np.empty(1, np.int64)
     for eye, expected in ((above, 1), (below, 0)):
-        nearest_facing(point, eye, wall, normals, True, 2e-3, nearest)
+        nearest = nearest_facing(point, eye, wall, normals, True, 2e-3)
         assert nearest[0] == expected
-    nearest_facing(point, above, wall, normals, False, 2e-3, nearest)  # an open surface has no sides
+    nearest = nearest_facing(point, above, wall, normals, False, 2e-3)  # an open surface has no sides
     assert nearest[0] == 0
-    nearest_facing(point, above, wall, normals, True, 1e-4, nearest)  # farther than any wall is thick
+    nearest = nearest_facing(point, above, wall, normals, True, 1e-4)  # farther than any wall is thick
     assert nearest[0] == 0

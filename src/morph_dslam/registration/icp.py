@@ -10,8 +10,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from morph_dslam.geometry import SimilarityTransform, rotation_exp
+from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.model.reduced_model import spread_over, triangle_normals
+from morph_dslam.registration.increments import moved_similarity
 from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints
 
@@ -148,11 +149,7 @@ def fit_surface(
         matrix, right, weights = surface_equations(points, surface, transform, surface.centre, width)
         prior = step_prior(weights.sum(), surface.radius * transform.scale, metric)
         step = damped_step(matrix, right, prior)
-        middle = transform.apply(surface.centre)
-        scale = transform.scale * float(np.exp(step[0]))
-        rotation = rotation_exp(step[1:4]) @ transform.rotation
-        translation = middle + step[4:] - scale * rotation @ surface.centre
-        transform = SimilarityTransform(scale, rotation, translation)
+        transform = moved_similarity(transform, step, surface.centre)
     return transform, weights
 
 
@@ -274,12 +271,12 @@ def damped_step(matrix, right, prior):
         else:
             damped[i, i] += prior[i]
     step = np.linalg.solve(damped, aim)
-    for i in range(4):
-        step[i] = min(max(step[i], -0.3), 0.3)
+    step[:4] = np.clip(step[:4], -0.3, 0.3)
     return step
 
 
-#: Two places are one if the surfaces are this near to each other, over their size. Then their middles are so, too.
+#: Two places are one if the surfaces are this near to each other, over their size; not where their middles are farther
+#: apart than that.
 SAME_PLACE, SAME_MIDDLE = 0.05, 0.4
 
 

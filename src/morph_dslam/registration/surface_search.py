@@ -61,21 +61,9 @@ def laid(
 
 @njit(cache=True, nogil=True)
 def lay_all(
-    positions,
-    viewpoints,
-    samples,
-    normals,
-    closed,
-    centre,
-    size,
-    radius,
-    widths,
-    metric,
-    scales,
-    rotations,
-    translations,
-    weights,
-):
+    positions, viewpoints, samples, normals, closed, centre, size, radius, widths, metric,
+    scales, rotations, translations, weights,
+):  # fmt: skip
     """Move each start to where it ends, and fill in the sums of the points' weights there.
 
     Parameters
@@ -88,51 +76,29 @@ def lay_all(
     scales, rotations, translations : (s,), (s, 3, 3) and (s, 3) of the starts, changed.
     weights : (s,) filled.
     """
-    nearest, local, eyes = (
-        np.empty(len(positions), np.int64),
-        np.empty((len(positions), 3)),
-        np.empty((len(positions), 3)),
-    )
-    middle = np.empty(3)
     for s in range(len(scales)):
-        first = scales[s]
+        first = scales[s] * size
         for width in widths:
-            for p in range(len(positions)):
-                for x in range(3):
-                    local[p, x] = eyes[p, x] = 0.0
-                    for y in range(3):
-                        local[p, x] += rotations[s, y, x] * (positions[p, y] - translations[s, y]) / scales[s]
-                        eyes[p, x] += rotations[s, y, x] * (viewpoints[p, y] - translations[s, y]) / scales[s]
-            nearest_facing(local, eyes, samples, normals, closed, WALL * size, nearest)
-            for x in range(3):
-                middle[x] = translations[s, x]
-                for y in range(3):
-                    middle[x] += scales[s] * rotations[s, x, y] * centre[y]
+            nearest = nearest_facing(
+                (positions - translations[s]) @ rotations[s] / scales[s],
+                (viewpoints - translations[s]) @ rotations[s] / scales[s],
+                samples, normals, closed, WALL * size,
+            )  # fmt: skip
+            middle = translations[s] + scales[s] * (rotations[s] @ centre)
             matrix, right, of_points = normal_equations(
-                positions,
-                samples,
-                normals,
-                nearest,
-                rotations[s],
-                middle,
-                scales[s],
-                centre,
-                first * size * width,
-                False,
-            )
+                positions, samples, normals, nearest,
+                rotations[s], middle, scales[s], centre, first * width, False,
+            )  # fmt: skip
             weights[s] = of_points.sum()
             step = damped_step(matrix, right, step_prior(weights[s], radius * scales[s], metric))
             scales[s] *= np.exp(step[0])
             rotations[s] = rotation_exp(step[1:4]) @ rotations[s]
-            for x in range(3):
-                translations[s, x] = middle[x] + step[4 + x]
-                for y in range(3):
-                    translations[s, x] -= scales[s] * rotations[s, x, y] * centre[y]
+            translations[s] = middle + step[4:] - scales[s] * (rotations[s] @ centre)
 
 
 @njit(cache=True, nogil=True)
-def nearest_facing(points, viewpoints, samples, normals, closed, wall, nearest):
-    """Fill in the nearest sample (p,) of each point that faces its viewpoint.
+def nearest_facing(points, viewpoints, samples, normals, closed, wall):
+    """The nearest sample (p,) of each point that faces its viewpoint.
 
     Where that is farther than the nearest of all by more than a ``wall``, or the surface is open, it is that one.
 
@@ -142,8 +108,8 @@ def nearest_facing(points, viewpoints, samples, normals, closed, wall, nearest):
     samples, normals : (n, 3).
     closed : whether the surface has an inside.
     wall : how thick a wall of a hollow body is at most.
-    nearest : (p,) filled.
     """
+    nearest = np.empty(len(points), np.int64)
     for p in range(len(points)):
         x, y, z = points[p]
         u, v, w = viewpoints[p, 0] - x, viewpoints[p, 1] - y, viewpoints[p, 2] - z
@@ -156,3 +122,4 @@ def nearest_facing(points, viewpoints, samples, normals, closed, wall, nearest):
             if square < least_facing and normals[n, 0] * u + normals[n, 1] * v + normals[n, 2] * w > 0.0:
                 least_facing, facing = square, n
         nearest[p] = facing if closed and np.sqrt(least_facing) <= np.sqrt(least) + wall else of_all
+    return nearest

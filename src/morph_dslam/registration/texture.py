@@ -131,6 +131,8 @@ class TextureComparison:
         views : keyframes of the map.
         metric : keep the scale.
 
+        Returns
+        -------
         None where too little can be compared.
         """
         views = views_of(self._nodes, start, views, self._camera, MOST_VIEWS)

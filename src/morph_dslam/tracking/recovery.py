@@ -80,22 +80,17 @@ class Recovery:
             return 0.0
         return float(np.sqrt(spread**2 - self._usual_px**2))
 
-    def reject(self, attempt: PoseHypothesis) -> Rejection | None:
-        """Why an object that was not seen in the frame before is not accepted; None when it is."""
+    def reject(self, attempt: PoseHypothesis, followed: bool) -> Rejection | None:
+        """Why an object is not accepted; None when it is. One that was not ``followed`` must agree more closely."""
         rejection = reject(attempt, self._options)
-        if rejection is not None or attempt.prior is not None:
+        if rejection is not None or attempt.outline_alone or attempt.prior is not None or self.most_agree(attempt):
             return rejection
-        if self.most_agree(attempt) or self._agrees_closely(attempt):
+        least, to_usual = (LOOSE_PX, LOOSE_TO_USUAL) if followed else (CLOSE_PX, CLOSE_TO_USUAL)
+        usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
+        if attempt.estimate.sigma_px < max(least, to_usual * usual):
             return None
-        return _loose(attempt)
-
-    def reject_followed(self, attempt: PoseHypothesis) -> Rejection | None:
-        """Why an object that was followed from the frame before is not accepted; None when it is."""
-        rejection = reject(attempt, self._options)
-        if rejection is not None or attempt.prior is not None or attempt.outline_alone or self.most_agree(attempt):
-            return rejection
-        loose = max(LOOSE_PX, LOOSE_TO_USUAL * np.nan_to_num(self._usual_px))
-        return _loose(attempt) if attempt.estimate.sigma_px > loose else None
+        visible, count = attempt.counts
+        return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
 
     def most_agree(self, attempt: PoseHypothesis) -> bool:
         """Whether half of all points agree."""
@@ -104,10 +99,6 @@ class Recovery:
     def partly_hidden(self, attempt: PoseHypothesis) -> bool:
         """Whether something else seems to be before the object."""
         return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
-
-    def _agrees_closely(self, attempt: PoseHypothesis) -> bool:
-        usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
-        return attempt.estimate.sigma_px < max(CLOSE_PX, CLOSE_TO_USUAL * usual)
 
     def recover(
         self, picture: Image, last_shape: Array, rejection: Rejection
@@ -169,7 +160,7 @@ class Recovery:
         with stage("search"):
             better = self._estimation.best_of(candidate, self._starts(candidate))
         candidate = self._estimation.correct(picture, better.estimate.state, None, None)
-        return (candidate if self.reject(candidate) is None else None), None
+        return (candidate if self.reject(candidate, followed=False) is None else None), None
 
     def _starts(self, candidate: PoseHypothesis) -> list[State]:
         """Shapes spread over the box, each in the poses in which it fits the supporting points best."""
@@ -196,8 +187,3 @@ class Recovery:
                 shape[k] = lower[k] + share * (upper[k] - lower[k])
                 shapes.append(shape)
         return shapes
-
-
-def _loose(attempt: PoseHypothesis) -> Rejection:
-    visible, count = attempt.counts
-    return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)

@@ -301,11 +301,8 @@ class Tracker:
 
     def _gate(self, hypothesis: PoseHypothesis) -> tuple[FoundBy, Rejection | None]:
         """Whether to accept the hypothesis; after a loss more is demanded."""
-        if self._lost and not hypothesis.outline_alone:
-            return FoundBy.LAST_STATE, self._view.recovery.reject(hypothesis)
-        if self._lost:
-            return FoundBy.LAST_STATE, reject(hypothesis, self.options)
-        return FoundBy.FLOW, self._view.recovery.reject_followed(hypothesis)
+        rejection = self._view.recovery.reject(hypothesis, followed=not self._lost)
+        return FoundBy.LAST_STATE if self._lost else FoundBy.FLOW, rejection
 
     def _relocalize(
         self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection, camera: CameraLocalization
