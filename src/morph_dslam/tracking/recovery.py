@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 #: pixels, or as so many times the usual spread of their residuals: what looks alike by chance does not, nor
 #: do windows that see the rim of what is before the object.
 CLOSE_PX, CLOSE_TO_USUAL = 0.25, 1.5
-#: An object that was followed is lost where fewer than half of its points agree, and these by more than this, pixels,
-#: and than so many times the usual spread.
+#: An object that was followed is lost where fewer of its points agree than `TrackerOptions.least_share`, and these by
+#: more than this, pixels, and than so many times the usual spread. Where more agree, the model may be that far off.
 LOOSE_PX, LOOSE_TO_USUAL = 1.0, 10.0
 #: Something is before the object where less than this share of the points that it does not hide itself agree.
 UNHIDDEN = 0.75
@@ -71,9 +71,9 @@ class Recovery:
         if np.isnan(self._usual_px):
             return 0.0
         if attempt.prior is not None:  # the pose is known, so that fewer points tell as much
-            if attempt.inliers.sum() >= self._options.least_share * len(attempt.inliers):
+            if self.agree(attempt, self._options.least_share):
                 return 0.0
-        elif self.most_agree(attempt) and not self.partly_hidden(attempt):
+        elif self.agree(attempt, MOST_AGREE) and not self.partly_hidden(attempt):
             return 0.0
         spread = attempt.estimate.sigma_px
         if spread < CLOSE_TO_USUAL * self._usual_px:
@@ -83,8 +83,10 @@ class Recovery:
     def reject(self, attempt: PoseHypothesis, followed: bool) -> Rejection | None:
         """Why an object is not accepted; None when it is. One that was not ``followed`` must agree more closely."""
         rejection = reject(attempt, self._options)
-        if rejection is not None or attempt.outline_alone or attempt.prior is not None or self.most_agree(attempt):
+        if rejection is not None or attempt.outline_alone or attempt.prior is not None:
             return rejection
+        if self.agree(attempt, self._options.least_share if followed else MOST_AGREE):
+            return None
         least, to_usual = (LOOSE_PX, LOOSE_TO_USUAL) if followed else (CLOSE_PX, CLOSE_TO_USUAL)
         usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
         if attempt.estimate.sigma_px < max(least, to_usual * usual):
@@ -92,9 +94,9 @@ class Recovery:
         visible, count = attempt.counts
         return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
 
-    def most_agree(self, attempt: PoseHypothesis) -> bool:
-        """Whether half of all points agree."""
-        return int(attempt.inliers.sum()) >= MOST_AGREE * len(attempt.inliers)
+    def agree(self, attempt: PoseHypothesis, share: float) -> bool:
+        """Whether this share of all points agree."""
+        return int(attempt.inliers.sum()) >= share * len(attempt.inliers)
 
     def partly_hidden(self, attempt: PoseHypothesis) -> bool:
         """Whether something else seems to be before the object."""
@@ -128,12 +130,12 @@ class Recovery:
         in the first of such frames and now and then. None where there is another one like it in the frame, too.
         """
         free = followed.prior is None and not followed.outline_alone
-        doubted = free and not self.most_agree(followed) and self.doubt(followed) > 0.0
+        doubted = free and not self.agree(followed, MOST_AGREE) and self.doubt(followed) > 0.0
         self._n_doubted = self._n_doubted + 1 if doubted else 0
         if not doubted or (self._n_doubted - 1) % self._options.look_every:
             return None
         found, _ = self._find(picture, self._shapes(last_shape), None)
-        if found is None or not self.most_agree(found) or found.estimate.sigma_px >= followed.estimate.sigma_px:
+        if found is None or not self.agree(found, MOST_AGREE) or found.estimate.sigma_px >= followed.estimate.sigma_px:
             return None
         return found if self.another(picture, found) is None else None
 
