@@ -79,7 +79,10 @@ def test_few_points_that_err_as_their_neighbours_do_are_those_of_an_object_that_
     assert rejection.spread_px == 2.5
 
 
-@pytest.mark.parametrize(("share", "followed", "believed"), [(0.4, True, True), (0.2, True, False), (0.4, False, False)])
+FOUND = [(0.4, True, True), (0.2, True, False), (0.4, False, False)]
+
+
+@pytest.mark.parametrize(("share", "followed", "believed"), FOUND)
 def test_a_followed_object_is_lost_where_very_few_points_agree_loosely(recovery, share, followed, believed):
     """Half of a sheet that is covered, with a model that is wrong by pixels, has more than that."""
     assert (recovery.reject(attempt(share, 3.5, alike=True), followed) is None) == believed

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import scipy.linalg
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
@@ -33,26 +36,37 @@ def design_matrix(samples: Array, lower: Array, upper: Array, indices: NDArray[n
     degree = int(indices.max())
     unit = np.eye(degree + 1)
     slope_series = chebyshev.chebder(unit) if degree else np.zeros((1, 1))
-    values = [chebyshev.chebval(xi[:, k], unit)[indices[:, k]].T for k in range(d)]
-    slopes = [chebyshev.chebval(xi[:, k], slope_series)[indices[:, k]].T for k in range(d)]
-    rows = [np.prod(values, axis=0)]
-    rows += [np.prod([slopes[j] if j == k else values[j] for j in range(d)], axis=0) for k in range(d)]
-    return np.array(rows, dtype=np.float64)
-
-
-def _normal_equations(design: Array, targets: Array, gradient_weight: float) -> tuple[Array, Array]:
-    """Matrix (n_terms, n_terms) and right-hand side of least squares over values and weighted gradients."""
-    weights = np.ones(len(design))
-    weights[1:] = gradient_weight
-    matrix = (design * weights[:, None, None]).reshape(-1, design.shape[2])
-    right = (targets * weights[:, None, None]).reshape(-1, targets.shape[2])
-    return matrix.T @ matrix, matrix.T @ right
+    values = [chebyshev.chebval(xi[:, k], unit).T[:, indices[:, k]] for k in range(d)]
+    slopes = [chebyshev.chebval(xi[:, k], slope_series).T[:, indices[:, k]] for k in range(d)]
+    rows = np.empty((1 + d, len(samples), len(indices)))
+    for row, j in zip(rows, (None, *range(d)), strict=True):
+        np.copyto(row, slopes[0] if j == 0 else values[0])
+        for k in range(1, d):
+            row *= slopes[k] if j == k else values[k]
+    return rows
 
 
 def _solve(gram: Array, right: Array) -> Array:
     """Coefficients (n_terms, n_functions)."""
     ridge = RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
-    return np.asarray(np.linalg.solve(gram + ridge, right), dtype=np.float64)
+    return np.asarray(scipy.linalg.solve(gram + ridge, right, assume_a="pos"), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Polynomials that were tried.
+
+    Attributes
+    ----------
+    indices : (n_terms, d) of them.
+    missed : relative root-mean-square error of the values of samples that were left out.
+    gram, right : normal equations of all samples, (n_terms, n_terms) and (n_terms, n_functions).
+    """
+
+    indices: NDArray[np.int64]
+    missed: float
+    gram: Array
+    right: Array
 
 
 class _Regression:
@@ -61,35 +75,40 @@ class _Regression:
     def __init__(
         self, samples: Array, targets: Array, box: Array, folds: NDArray[np.int64], gradient_weight: float
     ) -> None:
-        self._samples, self._targets, self._box = samples, targets, box
-        self._folds, self._gradient_weight = folds, gradient_weight
+        order = np.argsort(folds, kind="stable")
+        ends = np.cumsum(np.bincount(folds, minlength=FOLDS))
+        self._folds = [slice(end - size, end) for end, size in zip(ends, np.diff(ends, prepend=0), strict=True)]
+        self._box, self._samples = box, samples[order]
+        self._weights = np.where(np.arange(len(targets)) == 0, 1.0, gradient_weight)[:, None, None]
+        self._targets = targets[:, order] * self._weights
 
     def suits(self, indices: NDArray[np.int64]) -> bool:
         """Whether there are enough samples for so many terms when a fold is left out."""
-        equations = len(self._targets) * np.mean(self._folds != 0) * len(self._samples)
-        return len(indices) <= 0.8 * equations
+        used = len(self._samples) - (self._folds[0].stop - self._folds[0].start)
+        return len(indices) <= 0.8 * len(self._targets) * used
 
-    def missed(self, indices: NDArray[np.int64]) -> float:
-        """Relative root-mean-square error of the values of samples that were left out."""
-        design, missed = self._design(indices), 0.0
-        folds = [self._folds == fold for fold in range(FOLDS)]
-        parts = [self._equations(design, fold) for fold in folds]
-        gram, right = sum(part[0] for part in parts), sum(part[1] for part in parts)
-        for fold, part in zip(folds, parts, strict=True):
+    def trial(self, indices: NDArray[np.int64]) -> _Trial:
+        """Fit polynomials to all samples but one fold after the other."""
+        design = design_matrix(self._samples, self._box[0], self._box[1], indices)[: len(self._targets)]
+        design *= self._weights
+        parts = [_normal_equations(design[:, fold], self._targets[:, fold]) for fold in self._folds]
+        gram, right, missed = np.zeros_like(parts[0][0]), np.zeros_like(parts[0][1]), 0.0
+        for part in parts:
+            gram += part[0]
+            right += part[1]
+        for fold, part in zip(self._folds, parts, strict=True):
             coefficients = _solve(gram - part[0], right - part[1])
             missed += float(np.sum((design[0, fold] @ coefficients - self._targets[0, fold]) ** 2))
-        return float(np.sqrt(missed / np.sum(self._targets[0] ** 2)))
+        return _Trial(indices, float(np.sqrt(missed / np.sum(self._targets[0] ** 2))), gram, right)
 
-    def functions(self, indices: NDArray[np.int64]) -> ParameterFunctions:
-        everything = np.ones(len(self._samples), dtype=bool)
-        coefficients = _solve(*self._equations(self._design(indices), everything))
-        return ParameterFunctions(self._box[0], self._box[1], indices, coefficients)
+    def functions(self, trial: _Trial) -> ParameterFunctions:
+        return ParameterFunctions(self._box[0], self._box[1], trial.indices, _solve(trial.gram, trial.right))
 
-    def _equations(self, design: Array, which: NDArray[np.bool_]) -> tuple[Array, Array]:
-        return _normal_equations(design[:, which], self._targets[:, which], self._gradient_weight)
 
-    def _design(self, indices: NDArray[np.int64]) -> Array:
-        return design_matrix(self._samples, self._box[0], self._box[1], indices)[: len(self._targets)]
+def _normal_equations(design: Array, targets: Array) -> tuple[Array, Array]:
+    """Matrix (n_terms, n_terms) and right-hand side (n_terms, n_functions) of least squares over all rows."""
+    matrix = design.reshape(-1, design.shape[2])
+    return matrix.T @ matrix, matrix.T @ targets.reshape(-1, targets.shape[2])
 
 
 def fit_functions(
@@ -126,30 +145,33 @@ def fit_functions(
     d = samples.shape[1]
     fit = _Regression(samples, targets, np.array([lower, upper]), groups % FOLDS, gradient_weight)
     errors: dict[int, float] = {}
+    best: _Trial | None = None
     for degree in range(2, max_degree + 1):
         indices = total_degree_indices(d, degree)
         if not fit.suits(indices):
             break
-        errors[degree] = fit.missed(indices)
-    if not errors:
+        trial = fit.trial(indices)
+        errors[degree] = trial.missed
+        if best is None or trial.missed < best.missed:
+            best = trial
+    if best is None:
         raise StudyError(f"{len(samples)} training samples are too few for {d} parameters: solve more")
-    best = min(errors, key=lambda degree: errors[degree])
-    indices = total_degree_indices(d, best)
     if raise_single and d > 1:
-        indices = _raised(fit, [best] * d, errors[best], 3 * max_degree)
-    return fit.functions(indices), errors
+        best = _raised(fit, best, 3 * max_degree)
+    return fit.functions(best), errors
 
 
-def _raised(fit: _Regression, degrees: list[int], error: float, highest: int) -> NDArray[np.int64]:
-    """Multi-indices with the degrees of single parameters raised by half while that predicts better."""
-    best = weighted_degree_indices(degrees)
+def _raised(fit: _Regression, best: _Trial, highest: int) -> _Trial:
+    """The best with the degrees of single parameters raised by half while that predicts better."""
+    degrees = best.indices.max(axis=0).tolist()
     for k in range(len(degrees)):
         while degrees[k] < highest:
             tried = [*degrees[:k], min(3 * degrees[k] // 2, highest), *degrees[k + 1 :]]
             indices = weighted_degree_indices(tried)
             if len(indices) > MOST_TERMS or not fit.suits(indices):
                 break
-            if (missed := fit.missed(indices)) > WORTH_RAISING * error:
+            trial = fit.trial(indices)
+            if trial.missed > WORTH_RAISING * best.missed:
                 break
-            best, degrees, error = indices, tried, missed
+            best, degrees = trial, tried
     return best

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -351,10 +351,12 @@ class SheetStudy(Section):
 
     def images(self, snapshot: Snapshot) -> list[Snapshot]:
         """This state and its mirror images that are states of the same sheet."""
-        result = [snapshot, mirrored(snapshot)]
+        # Fields are read from a file each time they are asked for.
+        read = replace(snapshot, fields=dict(snapshot.fields), sensitivities=dict(snapshot.sensitivities))
+        result = [snapshot, mirrored(read)]
         columns = self.reduction.grid[0] + 1
         if self.grips.symmetric:
-            result += [reversed_ends(image, columns) for image in result]
+            result += [reversed_ends(image, columns) for image in (read, result[1])]
         if self.grips.centred:
             result += [upside_down(image, columns) for image in result]
         return result
