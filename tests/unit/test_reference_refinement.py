@@ -10,7 +10,7 @@ from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.known_state import LandmarkTerm
-from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, refine_by_depth, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, minimum, refine_by_depth, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA, mean_error, sheet_depth, sheet_state
@@ -101,3 +101,13 @@ def test_depth_of_something_else_is_refused():
     image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0)) + np.float32(0.3)
     with pytest.raises(RegistrationError, match="is the depth registered to this camera"):
         refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
+
+
+def test_residuals_that_are_known_to_few_digits_have_their_minimum_found():
+    """Linear ones, rounded as an inner search leaves them: against the normal equations of the exact ones."""
+    rng = np.random.default_rng(3)
+    matrix, right = rng.standard_normal((40, 5)), 0.5 * rng.standard_normal(40)
+    bounds = np.full(5, -np.inf), np.full(5, np.inf)
+    found = minimum(lambda x: np.round(matrix @ x - right, 5), np.zeros(5), bounds, 10)
+    np.testing.assert_allclose(found.x, np.linalg.lstsq(matrix, right, rcond=None)[0], atol=1e-3)
+    np.testing.assert_allclose(found.jac, matrix, atol=2e-3)

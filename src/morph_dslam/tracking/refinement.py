@@ -8,13 +8,14 @@ those of keyframes, each at its own best state (variable projection), are minimi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
@@ -24,6 +25,8 @@ from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
+#: Step of scaled unknowns that derivatives are differences over.
+DIFFERENCE = 1e-2
 
 
 @dataclass(frozen=True)
@@ -134,11 +137,25 @@ def refine_reference(
         result[free] = step
         return result
 
-    found = least_squares(
-        lambda step: residuals(whole(step)), np.zeros(len(free)), bounds=(bounds[0, free], bounds[1, free]),
-        diff_step=1e-2, max_nfev=10, ftol=1e-4,
-    )  # fmt: skip
+    found = minimum(lambda step: residuals(whole(step)), np.zeros(len(free)), (bounds[0, free], bounds[1, free]), 10)
     return reference(whole(found.x))
+
+
+def minimum(
+    residuals: Callable[[Array], Array], start: Array, bounds: tuple[Array, Array], steps: int
+) -> OptimizeResult:
+    """The unknowns, scaled, of the least squares of residuals that are minima over other unknowns themselves.
+
+    Such residuals are known as well as those minima are found, so derivatives are differences over `DIFFERENCE`; the
+    steps that SciPy takes by itself are shares of the unknowns, and vanish where these are zero.
+    """
+
+    def jacobian(unknowns: Array) -> Array:
+        inside = np.where(unknowns + DIFFERENCE > bounds[1], -DIFFERENCE, DIFFERENCE)
+        return np.asarray(approx_fprime(unknowns, residuals, inside))
+
+    derivatives: Any = jacobian  # SciPy's types know names of methods only
+    return least_squares(residuals, start, derivatives, bounds, max_nfev=steps, ftol=1e-4)
 
 
 def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe) -> Array:

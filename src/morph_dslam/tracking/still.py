@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import OptimizeResult
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
@@ -22,7 +22,7 @@ from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
-from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, Keyframe
+from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, Keyframe, minimum
 from morph_dslam.tracking.state import Prior, pose_increment
 
 Array = NDArray[np.float64]
@@ -262,6 +262,4 @@ def fit_still(problem: StillProblem, alternatives: Sequence[State] = ()) -> Stil
 
 
 def _minimum(problem: StillProblem, start: Array) -> OptimizeResult:
-    return least_squares(
-        problem.residuals, start, bounds=problem.bounds(), diff_step=1e-2, max_nfev=12, ftol=1e-4, x_scale=1.0
-    )
+    return minimum(problem.residuals, start, problem.bounds(), 12)
