@@ -12,6 +12,7 @@ from morph_dslam.streams.destinations import check_destination
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
+from morph_dslam.tracking.still import TERM_STD
 
 
 def _n_starts(part: ObjectOptions) -> int:
@@ -117,6 +118,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         lambda run: bool(run.refine_camera) and (run.live or run.tracker.pose != "still" or bool(run.others)),
         "the camera is estimated with the one pose of one object over a recording: give --still, or leave out "
         "--refine-camera",
+    ),
+    (
+        lambda run: not set(run.refine_camera) <= set(TERM_STD),
+        f"--refine-camera (refine_camera) estimates {' and '.join(TERM_STD)} here: leave out the other terms",
     ),
     (
         lambda run: run.refine_reference and bool(run.other_cameras),
