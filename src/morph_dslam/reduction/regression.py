@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
@@ -49,7 +48,7 @@ def design_matrix(samples: Array, lower: Array, upper: Array, indices: NDArray[n
 def _solve(gram: Array, right: Array) -> Array:
     """Coefficients (n_terms, n_functions)."""
     ridge = RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
-    return np.asarray(scipy.linalg.solve(gram + ridge, right, assume_a="pos"), dtype=np.float64)
+    return np.asarray(np.linalg.solve(gram + ridge, right), dtype=np.float64)
 
 
 @dataclass(frozen=True)

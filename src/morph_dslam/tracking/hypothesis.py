@@ -97,6 +97,11 @@ class PoseHypothesis:
         return int(self.measurement.visible.sum()), int(self.inliers.sum())
 
 
+def agree(hypothesis: PoseHypothesis, share: float) -> bool:
+    """Whether this share of all points support a hypothesis."""
+    return int(hypothesis.inliers.sum()) >= share * len(hypothesis.inliers)
+
+
 def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | None:
     """Why a hypothesis is not accepted; None when it is.
 
@@ -111,7 +116,7 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
     needed = min(options.least_inliers, int(np.ceil(options.least_share * len(hypothesis.inliers))))
     spread = hypothesis.estimate.sigma_px
     if count >= needed:
-        few, limit = count < MOST_AGREE * len(hypothesis.inliers), options.few_sigma_px
+        few, limit = not agree(hypothesis, MOST_AGREE), options.few_sigma_px
         if few and spread > limit and _own_spread(hypothesis) > limit:
             return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=spread)
         return None

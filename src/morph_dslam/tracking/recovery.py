@@ -12,7 +12,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.registration.landmarks import shape_starts, solve_pnp
 from morph_dslam.timing import stage
 from morph_dslam.tracking.frame_estimation import FrameEstimation
-from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, reject
+from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, agree, reject
 from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
@@ -71,9 +71,9 @@ class Recovery:
         if np.isnan(self._usual_px):
             return 0.0
         if attempt.prior is not None:  # the pose is known, so that fewer points tell as much
-            if self.agree(attempt, self._options.least_share):
+            if agree(attempt, self._options.least_share):
                 return 0.0
-        elif self.agree(attempt, MOST_AGREE) and not self.partly_hidden(attempt):
+        elif agree(attempt, MOST_AGREE) and not self.partly_hidden(attempt):
             return 0.0
         spread = attempt.estimate.sigma_px
         if spread < CLOSE_TO_USUAL * self._usual_px:
@@ -85,7 +85,7 @@ class Recovery:
         rejection = reject(attempt, self._options)
         if rejection is not None or attempt.outline_alone or attempt.prior is not None:
             return rejection
-        if self.agree(attempt, self._options.least_share if followed else MOST_AGREE):
+        if agree(attempt, self._options.least_share if followed else MOST_AGREE):
             return None
         least, to_usual = (LOOSE_PX, LOOSE_TO_USUAL) if followed else (CLOSE_PX, CLOSE_TO_USUAL)
         usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
@@ -93,10 +93,6 @@ class Recovery:
             return None
         visible, count = attempt.counts
         return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
-
-    def agree(self, attempt: PoseHypothesis, share: float) -> bool:
-        """Whether this share of all points agree."""
-        return int(attempt.inliers.sum()) >= share * len(attempt.inliers)
 
     def partly_hidden(self, attempt: PoseHypothesis) -> bool:
         """Whether something else seems to be before the object."""
@@ -130,12 +126,12 @@ class Recovery:
         in the first of such frames and now and then. None where there is another one like it in the frame, too.
         """
         free = followed.prior is None and not followed.outline_alone
-        doubted = free and not self.agree(followed, MOST_AGREE) and self.doubt(followed) > 0.0
+        doubted = free and not agree(followed, MOST_AGREE) and self.doubt(followed) > 0.0
         self._n_doubted = self._n_doubted + 1 if doubted else 0
         if not doubted or (self._n_doubted - 1) % self._options.look_every:
             return None
         found, _ = self._find(picture, self._shapes(last_shape), None)
-        if found is None or not self.agree(found, MOST_AGREE) or found.estimate.sigma_px >= followed.estimate.sigma_px:
+        if found is None or not agree(found, MOST_AGREE) or found.estimate.sigma_px >= followed.estimate.sigma_px:
             return None
         return found if self.another(picture, found) is None else None
 
