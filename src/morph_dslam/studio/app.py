@@ -96,7 +96,8 @@ class _Answers:
         if declared.isdecimal() and int(declared) > allowed.largest:
             raise HTTPException(413, f"{name} is larger than {allowed.largest} bytes, the most that is taken")
         path.parent.mkdir(exist_ok=True)
-        part, size = path.with_name(path.name + ".part"), 0
+        # Hidden until all of it is there.
+        part, size = path.with_name(f".{path.name}.part"), 0
         try:
             with part.open("wb") as file:
                 async for chunk in request.stream():

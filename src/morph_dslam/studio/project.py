@@ -142,7 +142,7 @@ class Project:
     def write(self, name: str, text: str) -> None:
         """Write a text file, whole or not at all."""
         path = self.path(name)
-        part = path.with_name(path.name + ".part")
+        part = path.with_name(f".{path.name}.part")
         part.write_text(text, encoding="utf-8")
         part.replace(path)
 
