@@ -14,6 +14,8 @@ from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_results import RunResults
 
 DPI = 110
+#: Width of a figure over the frames, the room around its axes, and between them, inches.
+WIDTH, LEFT, RIGHT, BOTTOM, TOP, GAP = 9.0, 0.95, 0.15, 0.5, 0.15, 0.12
 #: Stages that are drawn with a colour of their own: as many as there are colours, with this part of the time.
 MOST_STAGES, LEAST_SHARE = 10, 0.005
 
@@ -90,9 +92,18 @@ def plot_reactions(path: Path, run: RunResults) -> None:
     figure.savefig(path, dpi=DPI)
 
 
-def _rows(count: int, height: float) -> tuple[Figure, NDArray]:
-    figure = Figure(figsize=(9.0, 1.0 + height * count), layout="constrained")
+def _rows(count: int, height: float, top: float = TOP) -> tuple[Figure, NDArray]:
+    """A figure with axes one below the other over the frames, each of a height, inches, and room above them.
+
+    Their places are given: a layout engine would draw everything twice to find them, most of the time of a plot.
+    """
+    total = BOTTOM + top + count * height
+    figure = Figure(figsize=(WIDTH, total))
     all_axes = np.atleast_1d(figure.subplots(count, 1, sharex=True))
+    figure.subplots_adjust(
+        left=LEFT / WIDTH, right=1.0 - RIGHT / WIDTH, bottom=BOTTOM / total, top=1.0 - top / total, hspace=GAP / height
+    )
+    figure.align_ylabels(all_axes)
     all_axes[-1].set_xlabel("frame")
     return figure, all_axes
 
@@ -108,8 +119,7 @@ def _plot_band(axes: Axes, run: RunResults, value: NDArray, deviation: NDArray, 
 
 def plot_residual(path: Path, run: RunResults) -> None:
     """Residual of the supporting points, and how many they are."""
-    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, (upper, lower) = _rows(2, 1.9)
     upper.plot(run.frames, run.residuals_px(), color="#1f4e79", linewidth=1.4)
     upper.set_ylabel("residual (RMS) [px]")
     upper.set_ylim(bottom=0.0)
@@ -119,7 +129,6 @@ def plot_residual(path: Path, run: RunResults) -> None:
     lower.set_ylabel("points")
     lower.set_ylim(0.0, 1.1 * max(float(counts.max()), 1.0))
     lower.legend(loc="lower left", fontsize=8)
-    lower.set_xlabel("frame")
     for axes in (upper, lower):
         _shade_lost(axes, run)
     figure.savefig(path, dpi=DPI)
@@ -128,8 +137,7 @@ def plot_residual(path: Path, run: RunResults) -> None:
 def plot_timings(path: Path, run: RunResults) -> None:
     """Stage times stacked, with the time between two frames at 30 a second."""
     times = run.timings_ms()
-    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-    axes = figure.add_subplot()
+    figure, (axes,) = _rows(1, 3.0, top=0.4)
     sums = times[:, :-1].sum(axis=0)
     used = [int(k) for k in np.sort(np.argsort(sums)[-MOST_STAGES:]) if sums[k] > LEAST_SHARE * sums.sum()]
     rest = np.maximum(times[:, -1] - times[:, used].sum(axis=1), 0.0)
@@ -145,7 +153,6 @@ def plot_timings(path: Path, run: RunResults) -> None:
     axes.plot(run.frames, times[:, -1], color="#1b1f24", linewidth=0.9, label="total")
     axes.axhline(1e3 / 30, color="#d9534f", linewidth=1.0, linestyle="--", label="30 frames a second")
     axes.set_ylabel("time a frame [ms]")
-    axes.set_xlabel("frame")
     axes.set_title(f"median {np.median(times[:, -1]):.1f} ms", fontsize=10)
     axes.set_ylim(0.0, max(36.0, 1.1 * float(np.percentile(times[:, -1], 98))))
     axes.legend(loc="upper right", fontsize=8, ncols=4)
