@@ -16,14 +16,14 @@ def plate():
     return np.column_stack([points, np.zeros(350)])
 
 
-def detected(plate, residuals_of, used=None, seed=0):
+def detected(plate, residuals_of, used=None, seed=0, noise_px=0.3):
     """The detector after a test in which the plate is stretched from left to right, and the frame of its first find."""
     noise, first = np.random.default_rng(seed), None
     detector = JumpDetector(plate, float(np.linalg.norm(np.ptp(plate, axis=0))))
     for frame in range(FRAMES):
         stretch = 0.4 * frame / FRAMES
         displacement = np.column_stack([stretch * (plate[:, 0] + HALF[0]), np.zeros((350, 2))])
-        residuals = residuals_of(frame, plate / PX) + noise.normal(0.0, 0.3, (350, 2))
+        residuals = residuals_of(frame, plate / PX) + noise.normal(0.0, noise_px, (350, 2))
         detector.learn(residuals, np.ones(350, dtype=bool) if used is None else used(frame), displacement, PX)
         if detector.jumps and first is None:
             first = frame
@@ -81,6 +81,19 @@ def test_a_step_that_follows_the_deformation_is_no_crack(plate):
         return np.column_stack([0.05 * frame * np.sign(pixels[:, 0]) * (pixels[:, 1] > 0.0), np.zeros(len(pixels))])
 
     assert detected(plate, notch)[1] is None
+
+
+def test_folds_that_turn_otherwise_than_the_models_are_no_crack(plate):
+    # Two ridges 1 mm wide, 4 mm apart, each about its own middle: a plane and a step in the gap would fit them as well.
+    offsets = np.random.default_rng(5).uniform(-5e-4, 5e-4, 350)
+    plate[:, 0] = 2e-3 * np.sign(plate[:, 0]) + offsets
+
+    def turned(frame, pixels):
+        late = min(max(frame - BEGINS, 0) / 5.0, 1.0)
+        return np.column_stack([0.2 * late * offsets / PX, np.zeros(len(pixels))])
+
+    # 2 px across a ridge would be extrapolated to 8 px across the gap.
+    assert detected(plate, turned, noise_px=0.1)[1] is None
 
 
 def test_points_that_do_not_count_say_nothing(plate):

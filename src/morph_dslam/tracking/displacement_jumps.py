@@ -211,7 +211,8 @@ def _surroundings(rest: Array, reach: float) -> tuple[Array, NDArray[np.int64], 
 def _fit_steps(rows, first, plane, values, usable, directions, least):
     """Steps (k, d, 2) of ``values`` (p, 2) across lines through places, and their deviations (k, d); NaN where there
     are too few points. Each is from the least squares fit of a plane and a step; what the plane takes of the step's
-    own pattern is taken from that first (Frisch and Waugh, Econometrica 1, 1933)."""
+    own pattern is taken from that first (Frisch and Waugh, Econometrica 1, 1933). A step is no larger than the values
+    differ: where there are no points near the line, as between the folds of a bellows, it would be extrapolated."""
     count, most = len(first) - 1, np.max(np.diff(first))
     steps, deviations = np.full((count, directions, 2), np.nan), np.full((count, directions), np.nan)
     # By rows: ones and the place's two coordinates, made orthonormal, then the two values, less what these explain.
@@ -226,6 +227,7 @@ def _fit_steps(rows, first, plane, values, usable, directions, least):
         if n < 2 * least + 2:
             continue
         right, down = work[1, :n].copy(), work[2, :n].copy()
+        most_u, most_v = np.ptp(work[3, :n]), np.ptp(work[4, :n])
         for row in range(5):
             _take_from(work, n, row)
         squares = _product(work[3], work[3], n) + _product(work[4], work[4], n)
@@ -242,7 +244,8 @@ def _fit_steps(rows, first, plane, values, usable, directions, least):
             for row in range(3):
                 size -= _product(work[row], sides, n) ** 2
             along_u, along_v = _product(work[3], sides, n), _product(work[4], sides, n)
-            steps[k, d, 0], steps[k, d, 1] = along_u / size, along_v / size
+            steps[k, d, 0] = min(max(along_u / size, -most_u), most_u)
+            steps[k, d, 1] = min(max(along_v / size, -most_v), most_v)
             unexplained = max(squares - (along_u**2 + along_v**2) / size, 0.0) / (2 * (n - 4))
             deviations[k, d] = np.sqrt(unexplained / size)
     return steps, deviations
