@@ -67,6 +67,8 @@ def test_summary_counts_and_flags():
     assert (unobservable.warning, unobservable.data["parameters"]) == (RunWarning.UNOBSERVABLE, ["skew"])
     assert summary["flags"] == [lost.text, at_bound.text, unobservable.text]
     assert summary["notices"][1] == {"kind": "at_bound", **data, "text": at_bound.text}
+    # Were it an angle about an axis of revolution, it would be the same a turn further on.
+    assert notices_of(replace(run, revolution_angles=("arch",))) == [lost, unobservable]
 
 
 def test_a_bound_where_the_undeformed_object_rests_is_no_warning():

@@ -108,7 +108,8 @@ class PlacedObject:
 
     def new_results(self, refined: bool = False) -> RunResults:
         """Results of no frame so far."""
-        return RunResults(self.model, self.frame, refined, self.options.per_sequence, self.options.modulus_std)
+        angles = self.registration.per_sequence
+        return RunResults(self.model, self.frame, refined, self.options.per_sequence, angles, self.options.modulus_std)
 
     def new_tracker(self) -> Tracker | RigTracker:
         """A tracker at its beginning; raises RegistrationError if the object shows too few corners."""

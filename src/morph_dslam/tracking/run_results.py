@@ -31,6 +31,7 @@ class RunResults:
     reference_frame : number of the frame that the object is known from.
     refined : whether the reference state was refined over the frames.
     per_sequence : names of the parameters that are the same in all frames.
+    revolution_angles : names of those that are angles about an axis of revolution, which go on beyond their bounds.
     modulus_std : standard deviation of a factor common to all moduli, a share.
     frames : (f,) numbers.
     timestamps : (f,) seconds.
@@ -41,6 +42,7 @@ class RunResults:
     reference_frame: int
     refined: bool = False
     per_sequence: tuple[str, ...] = ()
+    revolution_angles: tuple[str, ...] = ()
     modulus_std: float = 0.0
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
