@@ -105,6 +105,11 @@ def test_a_model_in_a_metric_scene_keeps_its_scale():
     found = register(Scene(CAMERA, rigid_map, Trajectory(np.zeros(0), np.zeros((0, 4, 4)))), model)
     assert found.map_registration.world_from_object.scale == 1.0
     assert apart(found.map_registration.world_from_object, METRIC, model.nodes) < 5e-4
+    # All depths of a depth camera may be off together by 2 % of the distance: two standard deviations.
+    ahead = cameras()[-1].apply(model.nodes).mean(axis=0)
+    towards = np.concatenate([np.zeros(3), ahead / np.linalg.norm(ahead)])
+    spread = found.map_registration.pose_covariance(cameras()[-1])
+    assert np.sqrt(towards @ spread @ towards) == pytest.approx(0.01 * np.linalg.norm(ahead), rel=0.1)
     assert found.warnings == ()
     assert [view.frame for view in found.keyframes] == [view.frame for view in views]
     assert len(found.views) == len(views)
