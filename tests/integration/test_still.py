@@ -14,12 +14,17 @@ from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.camera_files import load_camera, save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.sources import open_source
+from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.still import StillProblem, fit_still
+from morph_dslam.tracking.still_run import OpenedSurface
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import UPRIGHT, SheetFilm, mean_error, write_recording
+from tests.support.tracked_rig import placed_objects
 
 #: A long lens with a radial term that shifts the corners by some 17 pixels.
 CAMERA = Camera(640, 480, 1500.0, 1500.0, 320.0, 240.0, (0.6, 0.0, 0.0, 0.0))
@@ -39,7 +44,8 @@ def recording(tmp_path_factory):
     model = bent_sheet_model(43, 31)
     film = SheetFilm(model, replace(CAMERA, distortion=()))
     film.background[:] = 128
-    images = [recorded(film.frame(state(time))) for time in TIMES]
+    seen_at = ideal_pixels()
+    images = [recorded(film.frame(state(time)), seen_at) for time in TIMES]
     write_recording(folder, dict(enumerate(images)), model)
     save_camera(folder / "camera.yaml", CAMERA)
     rng = np.random.default_rng(3)
@@ -51,12 +57,16 @@ def recording(tmp_path_factory):
     return folder
 
 
-def recorded(image):
-    """A pinhole's image (h, w, 3) as the lens gives it."""
+def ideal_pixels():
+    """Where a pinhole has what each pixel of the lens shows: columns and rows (h, w)."""
     rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
     ideal = CAMERA.undistort_pixels(np.column_stack([columns.ravel(), rows.ravel()])).astype(np.float32)
-    x, y = ideal.reshape(CAMERA.height, CAMERA.width, 2).transpose(2, 0, 1)
-    return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return ideal.reshape(CAMERA.height, CAMERA.width, 2).transpose(2, 0, 1)
+
+
+def recorded(image, seen_at):
+    """A pinhole's image (h, w, 3) as the lens gives it."""
+    return cv2.remap(image, *seen_at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def track(recording, output, pose, camera="camera.yaml", **options):
@@ -151,6 +161,17 @@ def test_what_makes_no_sense_is_refused(recording, tmp_path, arguments, message)
     }  # fmt: skip
     with pytest.raises(md.MorphError, match=message):
         md.track(md.TrackOptions(**options | arguments))
+
+
+def test_where_an_earlier_pass_found_the_surface_open_is_kept_frame_by_frame(recording):
+    files = {"model": "sheet.morph", "camera": "camera.yaml", "landmarks": "landmarks.csv", "frames": "frames"}
+    (placed,) = placed_objects(**{what: recording / name for what, name in files.items()})
+    small, large = (DisplacementJump(np.array([0.05, 0.02, 0.0]), size, 0.03) for size in (0.002, 0.004))
+    known, frames = OpenedSurface(placed, {9: (small,), 12: (large,)}), open_source(recording / "frames")
+    assert known.first == 9
+    session = Session({"sheet": placed.new_tracker()}, frames, reregistration={"sheet": known})
+    found = [[jump.size for jump in tracked.results["sheet"].jumps] for tracked in session]
+    assert found == [[]] * 9 + [[small.size]] * 3 + [[large.size]] * 4
 
 
 def test_live_the_pose_is_estimated_anew_from_more_frames(recording, tmp_path):

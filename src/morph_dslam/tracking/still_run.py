@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -12,6 +12,7 @@ from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
@@ -92,6 +93,34 @@ def _state_term(part: PlacedObject) -> StateTerm:
     return StateTerm(part.registration.state, covariance, scale)
 
 
+class OpenedSurface(Reregistration):
+    """Tells a tracker frame by frame where an earlier pass over the recording found the surface open, as at a crack.
+
+    In a pose that such frames have no part in, the points beside the crack may be too far off to be believed.
+
+    Parameters
+    ----------
+    placed : the object.
+    frames : by number, what was found up to then.
+    """
+
+    def __init__(self, placed: PlacedObject, frames: Mapping[int, tuple[DisplacementJump, ...]]) -> None:
+        super().__init__(placed)
+        self.frames = frames
+
+    @property
+    def first(self) -> int:
+        """Number of the first of the frames."""
+        return min(self.frames)
+
+    def tracker(self, frames: Sequence[Frame], current: Tracker | RigTracker) -> Tracker | RigTracker:
+        """The current one, told of what was found."""
+        found = self.frames.get(frames[0].index)
+        if found is not None and isinstance(current, Tracker):
+            current.know_jumps(found)
+        return current
+
+
 class Sharpening(Reregistration):
     """Estimates the one pose anew while frames come, in a thread of its own.
 
@@ -114,15 +143,15 @@ class Sharpening(Reregistration):
     def tracker(self, frames: Sequence[Frame], current: Tracker | RigTracker) -> Tracker | RigTracker:
         """The tracker for the next frames: the current one, or one with a pose from more frames."""
         assert isinstance(current, Tracker)
-        if current.last_seen is not None and current.last_seen is not self._last_seen:
+        if current.last_seen is not None and current.last_seen is not self._last_seen and not current.jumps:
             self._take(current.last_seen)
         if self._running is not None and self._running.done():
             self._part, new = self._running.result()
             assert isinstance(new, Tracker)
             self._running, self._estimated = None, True
             self._seen, self._every = [], 1
-            state = replace(current.state, camera_from_object=new.state.camera_from_object)
-            new.continue_from(state, current.jumps)
+            new.continue_from(replace(current.state, camera_from_object=new.state.camera_from_object))
+            new.know_jumps(current.jumps)
             return new
         if self._running is None and self._count >= self._due_at:
             self._due_at = 2 * self._count

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import cache
@@ -52,7 +52,7 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session, SynchronizedFrames
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
 from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
-from morph_dslam.tracking.still_run import Sharpening, known_state, with_pose, with_still_pose
+from morph_dslam.tracking.still_run import OpenedSurface, Sharpening, known_state, with_pose, with_still_pose
 from morph_dslam.tracking.stream_sink import StreamedObject, StreamSink
 from morph_dslam.tracking.tracker import Tracker
 
@@ -200,7 +200,8 @@ class _Job:
         ]
         sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
-        self._times, self._seen = LiveTimes(), {part.name: [] for part in placed}
+        self._times = LiveTimes()
+        self._seen: dict[str, list[tuple[int, Keyframe]]] = {part.name: [] for part in placed}
         self._checks = {
             part.name: CameraCheck(part.camera, deforms=bool(part.model.parameters))
             for part in placed
@@ -232,17 +233,46 @@ class _Job:
             print(f"tracking {self._source.name} (Ctrl-C ends it)", file=sys.stderr)
         self._session.run(run.seconds, progress=not run.live)
         if run.in_two_passes:
-            print("refining what is one over the sequence ...", file=sys.stderr)
-            self._placed = [_refined(part, self._seen[part.name], run) for part in self._placed]
-            for folder, part in zip(self._folders, self._placed, strict=True):
-                folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
-            self._views = [_view_of(part, run) for part in self._placed]
-            sinks: list[Sink] = [*self._folders]
-            if self._log is not None:
-                self._log.start_again()
-                sinks.append(self._log)
-            sinks += self._begun_streams(self._placed)
-            new_session(self._placed, self._source, sinks).run(progress=True)
+            begun = self._placed
+            self._track_refined(begun, {})
+            opened = self._opened(begun)
+            if opened and not run.streams:  # what is sent is final
+                self._track_refined(begun, opened)
+
+    def _opened(self, placed: Sequence[PlacedObject]) -> dict[str, OpenedSurface]:
+        """The objects, by name, whose surface was found to open, and in which frames."""
+        opened = {}
+        for part, folder in zip(placed, self._folders, strict=True):
+            run = folder.results
+            found = {number: one.jumps for number, one in zip(run.frames, run.results, strict=True) if one.jumps}
+            if found:
+                opened[part.name] = OpenedSurface(part, found)
+        return opened
+
+    def _track_refined(self, begun: Sequence[PlacedObject], opened: Mapping[str, OpenedSurface]) -> None:
+        """Refine what is one over the sequence, and track once more.
+
+        Parameters
+        ----------
+        begun : the objects as the first pass had them.
+        opened : by name, what a pass before found of surfaces that open: no pose explains these frames.
+        """
+        run = self._run
+        print("refining what is one over the sequence ...", file=sys.stderr)
+        self._placed = []
+        for part in begun:
+            known = opened.get(part.name)
+            seen = [keyframe for frame, keyframe in self._seen[part.name] if known is None or frame < known.first]
+            self._placed.append(_refined(part, seen, run))
+        for folder, part in zip(self._folders, self._placed, strict=True):
+            folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
+        self._views = [_view_of(part, run) for part in self._placed]
+        sinks: list[Sink] = [*self._folders]
+        if self._log is not None:
+            self._log.start_again()
+            sinks.append(self._log)
+        sinks += self._begun_streams(self._placed)
+        new_session(self._placed, self._source, sinks, reregistration=opened).run(progress=True)
 
     def write(self, number: int, tell: Tell) -> dict[str, Any]:
         """Write the run folder of one object, the video last because it takes longest; returns the summary."""
@@ -325,7 +355,7 @@ class _Job:
         """Keep where the points of each object were seen, to refine its reference."""
         for name, tracker in self._session.trackers.items():
             if tracked.results[name].tracked and isinstance(tracker, Tracker) and tracker.last_seen is not None:
-                self._seen[name].append(tracker.last_seen)
+                self._seen[name].append((tracked.frame.index, tracker.last_seen))
 
 
 def _checks_camera(part: PlacedObject, run: TrackOptions) -> bool:

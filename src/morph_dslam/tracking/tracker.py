@@ -456,12 +456,12 @@ class Tracker:
         """Where the surface was found to open or slip along a line so far."""
         return (*self._jumps_before, *self._jumps.jumps)
 
-    def continue_from(self, state: State, jumps: Sequence[DisplacementJump] = ()) -> None:
-        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost.
-
-        What another tracker found of cracks in the frames before, ``jumps``, stays.
-        """
+    def know_jumps(self, jumps: Sequence[DisplacementJump]) -> None:
+        """Take in where another tracker found the surface open up to this frame."""
         self._jumps_before = tuple(jumps)
+
+    def continue_from(self, state: State) -> None:
+        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
         self._last = self._start = state
         self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
