@@ -26,8 +26,11 @@ demo: $(INSTALLED)
 COMPILED := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba
 PYTEST := $(COMPILED) $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
-# Lint runs beside the tests, which leave a core free now and then; what it finds is printed after them.
+# `morph doctor` compiles the inner loops of tracking once, before two processes would each do so. Lint runs beside it and
+# the tests, which leave a core free now and then; what it finds is printed after them.
 TEST_AND_LINT = $(MAKE) --no-print-directory lint > $(VENV)/lint.log 2>&1 & lint=$$!; status=0; \
+	echo "compiling the inner loops of tracking (a minute or two the first time)"; \
+	$(COMPILED) $(BIN)/morph doctor > $(VENV)/doctor.log 2>&1 || cat $(VENV)/doctor.log; \
 	$(1) || status=$$?; wait $$lint || status=$$?; cat $(VENV)/lint.log; exit $$status
 
 test: $(INSTALLED)
