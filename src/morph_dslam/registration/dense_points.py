@@ -21,6 +21,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.icp import Surface, surface_equations
 from morph_dslam.registration.scene import MapPoints, View
+from morph_dslam.render.packed_texture import PARTS, interpolated, pack_texture
 from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]
@@ -159,7 +160,7 @@ def _stereo(points: MapPoints, view: View, views: Sequence[View], camera: Camera
     inverse_depths = np.linspace(1.0 / farthest, 1.0 / nearest, steps)
     found, best, next_best = sweep(
         view.normalized,
-        np.stack([other.normalized for other in others]),
+        np.stack([pack_texture(other.normalized) for other in others]),
         np.array([matrix @ between[:3, :3] @ np.linalg.inv(matrix) for between in moved]),
         np.array([matrix @ between[:3, 3] for between in moved]),
         pixels,
@@ -199,14 +200,14 @@ def _contrasting(image: NDArray[np.uint8]) -> NDArray[np.int64]:
     return np.column_stack([column, row]).astype(np.int64)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sweep(image, others, turns, shifts, pixels, inverse_depths, half):
     """The inverse depth at which the other images look most alike at each pixel.
 
     Parameters
     ----------
     image : (h, w) uint8.
-    others : (v, h, w) uint8.
+    others : (v, h, w) uint32, of `pack_texture`.
     turns : (v, 3, 3) that take homogeneous pixels at infinity to those of the others.
     shifts : (v, 3) to be added for every unit of inverse depth.
     pixels : (n, 2) int64, farther than ``half`` from the border.
@@ -218,56 +219,28 @@ def sweep(image, others, turns, shifts, pixels, inverse_depths, half):
     Inverse depths (n,), interpolated; the mean correlation (n,) of the better half of the others there; and that (n,)
     of the next best depth that is a maximum of its own. The correlation is -1 where there is none.
     """
-    height, width = image.shape
     n, n_depths, n_others = len(pixels), len(inverse_depths), len(others)
-    count = (2 * half + 1) ** 2
-    patch, scores, each = np.empty(count), np.empty(n_depths), np.empty(n_others)
+    patch, scores, each = np.empty((2 * half + 1) ** 2, np.int64), np.empty(n_depths), np.empty(n_others)
     found, best, second = np.zeros(n), np.full(n, -1.0), np.full(n, -1.0)
     for p in range(n):
         x, y = pixels[p]
-        total, square, k = 0.0, 0.0, 0
+        k = 0
         for j in range(-half, half + 1):
             for i in range(-half, half + 1):
-                value = float(image[y + j, x + i])
-                patch[k] = value
-                total, square, k = total + value, square + value * value, k + 1
-        mean = total / count
-        variance = square / count - mean * mean
+                patch[k] = image[y + j, x + i]
+                k += 1
+        mean = np.mean(patch)
+        variance = np.mean(patch * patch) - mean * mean
         if variance < LEAST_VARIANCE:
             continue
         for d in range(n_depths):
             seen = 0
             for v in range(n_others):
-                a, b = turns[v], inverse_depths[d] * shifts[v]
-                w = a[2, 0] * x + a[2, 1] * y + a[2, 2] + b[2]
-                if w <= 0.0:
-                    continue
-                u = (a[0, 0] * x + a[0, 1] * y + a[0, 2] + b[0]) / w
-                t = (a[1, 0] * x + a[1, 1] * y + a[1, 2] + b[1]) / w
-                # The patch is small: its warp is linear.
-                ux, uy = (a[0, 0] - u * a[2, 0]) / w, (a[0, 1] - u * a[2, 1]) / w
-                tx, ty = (a[1, 0] - t * a[2, 0]) / w, (a[1, 1] - t * a[2, 1]) / w
-                reach_u, reach_t = half * (abs(ux) + abs(uy)), half * (abs(tx) + abs(ty))
-                if u < reach_u or t < reach_t or u + reach_u >= width - 1 or t + reach_t >= height - 1:
-                    continue
-                total, square, product, k = 0.0, 0.0, 0.0, 0
-                for j in range(-half, half + 1):
-                    for i in range(-half, half + 1):
-                        column, row = u + ux * i + uy * j, t + tx * i + ty * j
-                        c, r = int(column), int(row)
-                        f, g = column - c, row - r
-                        value = (1.0 - g) * ((1.0 - f) * others[v, r, c] + f * others[v, r, c + 1]) + g * (
-                            (1.0 - f) * others[v, r + 1, c] + f * others[v, r + 1, c + 1]
-                        )
-                        total, square, product = total + value, square + value * value, product + value * patch[k]
-                        k += 1
-                spread = square / count - (total / count) ** 2
-                each[seen] = (product / count - mean * total / count) / np.sqrt(variance * max(spread, 1.0))
-                seen += 1
-            scores[d] = -1.0
-            if seen:
-                ranked = np.sort(each[:seen])
-                scores[d] = ranked[seen // 2 if seen > 2 else 0 :].mean()
+                likeness = _likeness(others[v], turns[v], inverse_depths[d] * shifts[v], x, y, half, patch, mean)
+                if likeness > -np.inf:
+                    each[seen] = likeness / np.sqrt(variance)
+                    seen += 1
+            scores[d] = _mean_of_better_half(each, seen) if seen else -1.0
         top = int(np.argmax(scores))
         if top == 0 or top == n_depths - 1 or scores[top] <= -1.0:
             continue
@@ -279,3 +252,56 @@ def sweep(image, others, turns, shifts, pixels, inverse_depths, half):
         aside = 0.5 * (scores[top - 1] - scores[top + 1]) / bend if bend < -1e-9 else 0.0
         found[p] = inverse_depths[top] + aside * (inverse_depths[1] - inverse_depths[0])
     return found, best, second
+
+
+#: Places in an image are whole numbers of these parts of a pixel; grey levels, of `PARTS`.
+FINE_PARTS = PARTS * PARTS
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _likeness(other, turn, shift, x, y, half, patch, mean):
+    """Covariance of a patch (k,) and what another image shows of it at a depth, over the deviation of the latter; minus
+    infinity where it leaves that image. The patch is small: its warp is linear. ``shift`` is that of the depth."""
+    height, width = other.shape
+    w = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + shift[2]
+    if w <= 0.0:
+        return -np.inf
+    u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + shift[0]) / w
+    t = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + shift[1]) / w
+    ux, uy = (turn[0, 0] - u * turn[2, 0]) / w, (turn[0, 1] - u * turn[2, 1]) / w
+    tx, ty = (turn[1, 0] - t * turn[2, 0]) / w, (turn[1, 1] - t * turn[2, 1]) / w
+    reach_u, reach_t = half * (abs(ux) + abs(uy)), half * (abs(tx) + abs(ty))
+    if u < reach_u or t < reach_t or u + reach_u >= width - 1 or t + reach_t >= height - 1:
+        return -np.inf
+    # Whole numbers, which add up exactly and take half the time.
+    right_x, right_y = np.int64(FINE_PARTS * ux), np.int64(FINE_PARTS * tx)
+    down_x, down_y = np.int64(FINE_PARTS * uy), np.int64(FINE_PARTS * ty)
+    line_x = np.int64(FINE_PARTS * u + 0.5 * PARTS) - half * (right_x + down_x)
+    line_y = np.int64(FINE_PARTS * t + 0.5 * PARTS) - half * (right_y + down_y)
+    total = square = product = np.int64(0)
+    k = 0
+    for _ in range(2 * half + 1):
+        column, row = line_x, line_y
+        for _ in range(2 * half + 1):
+            four = other[np.uint64(row >> 16), np.uint64(column >> 16)]  # unsigned, so that none counts from the end
+            value = interpolated(four, (column >> 8) & 255, (row >> 8) & 255) >> 8
+            total += value
+            square += value * value
+            product += value * patch[k]
+            column, row, k = column + right_x, row + right_y, k + 1
+        line_x, line_y = line_x + down_x, line_y + down_y
+    middle = total / (PARTS * k)
+    spread = square / (FINE_PARTS * k) - middle * middle
+    return (product / (PARTS * k) - mean * middle) / np.sqrt(max(spread, 1.0))
+
+
+@njit(cache=True, nogil=True)
+def _mean_of_better_half(values, count):
+    """The mean of the larger half of the first ``count`` numbers, which are put in order; of two, of both."""
+    for i in range(1, count):
+        held, k = values[i], i
+        while k > 0 and values[k - 1] > held:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = held
+    return np.mean(values[count // 2 if count > 2 else 0 : count])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
+from morph_dslam.render.packed_texture import PARTS, grey_at, pack_texture
 from morph_dslam.render.rasteriser import corner_weights, covered_steps, pack_nodes, pixel_window, visible_points
 from morph_dslam.tracking.binding import Drawing, View, signed_areas
 from morph_dslam.tracking.patches import NEUTRAL, compare_patches, follow
@@ -89,37 +90,6 @@ class ReferenceAppearance:
         return Rendering(image, depth, triangle_ids)
 
 
-#: Places in the texture are whole numbers of these parts of a pixel.
-PARTS = 256
-
-
-@njit(cache=True, nogil=True)
-def pack_texture(grey):
-    """A texture (h, w) uint8 with the neighbours to the right, below and diagonal of each pixel in one number, uint32.
-
-    What is interpolated then takes one access. Beyond the border, which is never interpolated towards, is zero.
-    """
-    height, width = grey.shape
-    packed = np.zeros((height, width), np.uint32)
-    for row in range(height):
-        for column in range(width):
-            for i in range(min(2, height - row)):
-                for j in range(min(2, width - column)):
-                    packed[row, column] |= np.uint32(grey[row + i, column + j]) << np.uint32(16 * i + 8 * j)
-    return packed
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _grey_at(packed, x, y):
-    """Grey level of a packed texture at a place in `PARTS` of a pixel, bilinearly; outside it is its border."""
-    column = int(min(max(x, 0.0), PARTS * (packed.shape[1] - 1)) + 0.5)
-    row = int(min(max(y, 0.0), PARTS * (packed.shape[0] - 1)) + 0.5)
-    four, right, below = np.int64(packed[row >> 8, column >> 8]), column & 255, row & 255
-    # Upper and lower row at once: each of the sums has sixteen bits.
-    both = (four & 0x00FF00FF) * (PARTS - right) + ((four >> 8) & 0x00FF00FF) * right
-    return np.uint8(((both & 0xFFFF) * (PARTS - below) + (both >> 16) * below + 32768) >> 16)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image, depth, triangle_ids):
     """Draw a textured surface over what is in ``image``, ``depth`` and ``triangle_ids`` already.
@@ -162,7 +132,7 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
                 if z < depth[row, column]:
                     depth[row, column], triangle_ids[row, column] = z, t
                     scale = 1.0 / (w + k * w_right)
-                    image[row, column] = _grey_at(texture, (x + k * x_right) * scale, (y + k * y_right) * scale)
+                    image[row, column] = grey_at(texture, (x + k * x_right) * scale, (y + k * y_right) * scale)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
