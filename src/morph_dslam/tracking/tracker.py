@@ -23,13 +23,14 @@ from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
-from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
+from morph_dslam.tracking.estimator import Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import (
     a_turn_back,
     at_constant_velocity,
     new_filter,
     with_unobservable_at_default,
 )
+from morph_dslam.tracking.frame_results import lost_result, pose_source, tracked_result
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
@@ -37,15 +38,10 @@ from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraLost,
-    FewPointsAgree,
     FoundBy,
-    ModelDoesNotExplain,
     ObjectMoved,
     OtherReferenceView,
-    PoseSource,
-    ReferenceWidened,
     Rejection,
-    Status,
     SurfaceJumps,
     TrackingWarning,
 )
@@ -54,7 +50,7 @@ from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.still import held
-from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, error_factors_of
+from morph_dslam.tracking.systematic_errors import error_factors_of
 from morph_dslam.tracking.views import (
     ActiveView,
     Change,
@@ -365,40 +361,14 @@ class Tracker:
     ) -> FrameResult:
         """Status, estimate with all known errors in its covariance, and warnings."""
         warnings = self._warnings_of_place(camera)
-        n_points, n_inliers = hypothesis.counts
         if rejection is not None:
             placed = self._placed_by_map(camera)
-            is_hidden = placed is not None
-            return FrameResult(
-                self.model,
-                Status.HIDDEN if is_hidden else Status.LOST,
-                rejection=rejection,
-                warnings=() if is_hidden else tuple(warnings),
-                pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
-                pose_prior=placed,
-                n_points=n_points,
-                n_inliers=n_inliers,
-                view=self._view.number,
-            )
-        estimate, unexplained_px, more = self._with_systematic_errors(hypothesis)
-        residuals, systematic = hypothesis.estimate.residuals[hypothesis.supporting], self._view.systematic
-        return FrameResult(
-            self.model,
-            Status.TRACKED,
-            estimate,
-            found_by,
-            warnings=(*warnings, *more),
-            pose_from=_pose_source(hypothesis, self.options.pose == "still"),
-            by_outline=hypothesis.outline_alone,
-            n_points=n_points,
-            n_inliers=n_inliers,
-            residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
-            unexplained_px=unexplained_px,
-            reference_factor=1.0 if systematic is None else systematic.reference_factor,
-            view=self._view.number,
-            discrepancy=hypothesis.discrepancy,
-            jumps=self.jumps,
-        )
+            result = lost_result(self.model, hypothesis, rejection, placed, warnings)
+        else:
+            result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings)
+            is_still = self.options.pose == "still"
+            result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
+        return replace(result, view=self._view.number)
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
         """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
@@ -413,28 +383,6 @@ class Tracker:
         if camera.why_lost:
             warnings.append(CameraLost(camera.why_lost))
         return warnings
-
-    def _with_systematic_errors(self, hypothesis: PoseHypothesis) -> tuple[Estimate, float, list[TrackingWarning]]:
-        """The estimate with errors that do not average out in its covariance, and what that says of it."""
-        systematic, recovery = self._view.systematic, self._view.recovery
-        if systematic is None:  # what is measured refers to no other image
-            left = self._view.estimation.left_by_outline(hypothesis)
-            return hypothesis.estimate, left.px, [ModelDoesNotExplain(left.px)] if left.is_failure else []
-        left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
-        doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
-        common_px = max(left.px, doubt_px)
-        past, keeps = self._filter.past_information, self._filter.keeps
-        estimate = systematic.added(
-            hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole, past, keeps
-        )
-        warnings: list[TrackingWarning] = []
-        if doubt_px:
-            warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
-        if left.is_failure:
-            warnings.append(ModelDoesNotExplain(left.px))
-        if systematic.reference_factor > CLEARLY_WORSE:
-            warnings.append(ReferenceWidened(systematic.reference_factor))
-        return estimate, left.px, warnings
 
     # -- reference views and state ------------------------------------------------------------------------
 
@@ -546,11 +494,3 @@ class Tracker:
         self._views.active, self._anchoring.reference = change.view, change.view.reference
         self._supported, self._pixels = change.supported, change.pixels
         return change
-
-
-def _pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:
-    if still:
-        return PoseSource.SEQUENCE
-    if hypothesis.outline_alone:
-        return PoseSource.OUTLINE if hypothesis.prior is None else PoseSource.OUTLINE_AND_MAP
-    return PoseSource.POINTS if hypothesis.prior is None else PoseSource.POINTS_AND_MAP

@@ -1,0 +1,120 @@
+"""The result of a frame from what was estimated in it: status, deviations with all known errors, and warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from morph_dslam.model import ReducedModel
+from morph_dslam.registration.registration import PosePrior
+from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.hypothesis import PoseHypothesis
+from morph_dslam.tracking.outcomes import (
+    FewPointsAgree,
+    ModelDoesNotExplain,
+    PoseSource,
+    ReferenceWidened,
+    Rejection,
+    Status,
+    TrackingWarning,
+)
+from morph_dslam.tracking.result import FrameResult
+from morph_dslam.tracking.sequence_filter import SequenceFilter
+from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
+from morph_dslam.tracking.views import ActiveView
+
+
+def lost_result(
+    model: ReducedModel,
+    hypothesis: PoseHypothesis,
+    rejection: Rejection,
+    placed: PosePrior | None,
+    warnings: Sequence[TrackingWarning],
+) -> FrameResult:
+    """The result of a frame in which a hypothesis is rejected: hidden where the map has the pose, or else lost.
+
+    Parameters
+    ----------
+    model : of the object.
+    hypothesis : that is rejected.
+    rejection : why.
+    placed : the pose by the map, if it is known.
+    warnings : of a lost object.
+    """
+    is_hidden, (n_points, n_inliers) = placed is not None, hypothesis.counts
+    return FrameResult(
+        model,
+        Status.HIDDEN if is_hidden else Status.LOST,
+        rejection=rejection,
+        warnings=() if is_hidden else tuple(warnings),
+        pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
+        pose_prior=placed,
+        n_points=n_points,
+        n_inliers=n_inliers,
+    )
+
+
+def tracked_result(
+    model: ReducedModel,
+    hypothesis: PoseHypothesis,
+    view: ActiveView,
+    past: SequenceFilter,
+    warnings: Sequence[TrackingWarning],
+) -> FrameResult:
+    """The result of a frame with an accepted hypothesis.
+
+    Parameters
+    ----------
+    model : of the object.
+    hypothesis : that is accepted.
+    view : that the frame was compared with.
+    past : what earlier frames tell.
+    warnings : of where the object is.
+    """
+    estimate, unexplained_px, more = _with_systematic_errors(hypothesis, view, past)
+    residuals, (n_points, n_inliers) = hypothesis.estimate.residuals[hypothesis.supporting], hypothesis.counts
+    return FrameResult(
+        model,
+        Status.TRACKED,
+        estimate,
+        warnings=(*warnings, *more),
+        by_outline=hypothesis.outline_alone,
+        n_points=n_points,
+        n_inliers=n_inliers,
+        residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
+        unexplained_px=unexplained_px,
+        reference_factor=1.0 if view.systematic is None else view.systematic.reference_factor,
+        discrepancy=hypothesis.discrepancy,
+    )
+
+
+def _with_systematic_errors(
+    hypothesis: PoseHypothesis, view: ActiveView, past: SequenceFilter
+) -> tuple[Estimate, float, list[TrackingWarning]]:
+    """The estimate with errors that do not average out in its covariance, and what that says of it."""
+    systematic, recovery = view.systematic, view.recovery
+    if systematic is None:  # what is measured refers to no other image
+        left = view.estimation.left_by_outline(hypothesis)
+        return hypothesis.estimate, left.px, [ModelDoesNotExplain(left.px)] if left.is_failure else []
+    left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
+    doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
+    common_px, known = max(left.px, doubt_px), (past.past_information, past.keeps)
+    estimate = systematic.added(hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole, *known)
+    warnings: list[TrackingWarning] = []
+    if doubt_px:
+        warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
+    if left.is_failure:
+        warnings.append(ModelDoesNotExplain(left.px))
+    if systematic.reference_factor > CLEARLY_WORSE:
+        warnings.append(ReferenceWidened(systematic.reference_factor))
+    return estimate, left.px, warnings
+
+
+def pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:
+    """Where an accepted hypothesis has its pose from; ``still`` where one pose holds over the sequence."""
+    if still:
+        return PoseSource.SEQUENCE
+    if hypothesis.outline_alone:
+        return PoseSource.OUTLINE if hypothesis.prior is None else PoseSource.OUTLINE_AND_MAP
+    return PoseSource.POINTS if hypothesis.prior is None else PoseSource.POINTS_AND_MAP
