@@ -68,7 +68,9 @@ def test_summary_counts_and_flags():
     assert summary["flags"] == [lost.text, at_bound.text, unobservable.text]
     assert summary["notices"][1] == {"kind": "at_bound", **data, "text": at_bound.text}
     # Were it an angle about an axis of revolution, it would be the same a turn further on.
-    assert notices_of(replace(run, revolution_angles=("arch",))) == [lost, unobservable]
+    turning = replace(run, revolution_angles=("arch",))
+    assert notices_of(turning) == [lost, unobservable]
+    assert not turning.at_bound().any()
 
 
 def test_a_bound_where_the_undeformed_object_rests_is_no_warning():

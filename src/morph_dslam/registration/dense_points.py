@@ -233,12 +233,13 @@ def sweep(image, others, turns, shifts, pixels, inverse_depths, half):
         variance = np.mean(patch * patch) - mean * mean
         if variance < LEAST_VARIANCE:
             continue
+        deviation = np.sqrt(variance)
         for d in range(n_depths):
             seen = 0
             for v in range(n_others):
                 likeness = _likeness(others[v], turns[v], inverse_depths[d] * shifts[v], x, y, half, patch, mean)
                 if likeness > -np.inf:
-                    each[seen] = likeness / np.sqrt(variance)
+                    each[seen] = likeness / deviation
                     seen += 1
             scores[d] = _mean_of_better_half(each, seen) if seen else -1.0
         top = int(np.argmax(scores))

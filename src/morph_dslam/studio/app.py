@@ -96,8 +96,7 @@ class _Answers:
         if declared.isdecimal() and int(declared) > allowed.largest:
             raise HTTPException(413, f"{name} is larger than {allowed.largest} bytes, the most that is taken")
         path.parent.mkdir(exist_ok=True)
-        # Hidden until all of it is there.
-        part, size = path.with_name(f".{path.name}.part"), 0
+        part, size = names.part_of(path), 0
         try:
             with part.open("wb") as file:
                 async for chunk in request.stream():

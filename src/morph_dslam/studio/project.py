@@ -142,7 +142,7 @@ class Project:
     def write(self, name: str, text: str) -> None:
         """Write a text file, whole or not at all."""
         path = self.path(name)
-        part = path.with_name(f".{path.name}.part")
+        part = part_of(path)
         part.write_text(text, encoding="utf-8")
         part.replace(path)
 
@@ -155,6 +155,11 @@ class Project:
     def files(self) -> list[str]:
         """Names of the files and folders, hidden ones left out."""
         return sorted(path.name for path in self.folder.iterdir() if _NAME.fullmatch(path.name))
+
+
+def part_of(path: Path) -> Path:
+    """Where a file of a project is written until all of it is there: hidden, so it is none of the project's yet."""
+    return path.with_name(f".{path.name}.part")
 
 
 def _shown(name: str) -> str:

@@ -171,11 +171,12 @@ def write_csv(path: Path, run: RunResults) -> None:
     header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
     header += ["residual_rms_px", "unexplained_px", "n_points", "n_inliers", "time_ms"]
     names, reactions = _reaction_columns(run)
-    rows = zip(run.frames, run.timestamps, run.results, 1e3 * run.largest_displacements(), reactions, strict=True)
+    largests = 1e3 * run.largest_displacements()
+    rows = zip(run.frames, run.timestamps, run.results, run.at_bound(), largests, reactions, strict=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header + names)
-        for frame, timestamp, result, largest, forces in rows:
+        for frame, timestamp, result, at_bound, largest, forces in rows:
             row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason, result.pose_from]
             if result.estimate is None:
                 row += [""] * (3 * len(parameters) + 10)
@@ -183,7 +184,7 @@ def write_csv(path: Path, run: RunResults) -> None:
                 state, std = result.estimate.state, result.estimate.parameter_std
                 for k, p in enumerate(parameters):
                     row += [f"{p.display(state.parameters[k]):.6g}", f"{p.display(std[k]):.3g}"]
-                    row.append(int(result.estimate.at_bound[k]))
+                    row.append(int(at_bound[k]))
                 row += [f"{largest[0]:.4f}", f"{largest[1]:.3g}"]
                 pose = state.camera_from_object
                 row += [f"{1e3 * value:.4f}" for value in pose.translation]

@@ -120,8 +120,6 @@ def _at_bound(run: RunResults) -> list[RunNotice]:
         determined = run.parameter_std() < UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
     at_bound, values = run.at_bound() & determined, run.parameters()
     for k, parameter in enumerate(run.model.study_parameters):
-        if parameter.name in run.revolution_angles:  # a turn further on the object is the same
-            continue
         upper = values[:, k] > 0.5 * (parameter.lower + parameter.upper)
         unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
         for bound, side, rows in ((parameter.lower, "lower", ~upper), (parameter.upper, "upper", upper)):

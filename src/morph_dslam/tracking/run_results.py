@@ -93,8 +93,9 @@ class RunResults:
         return self._of_estimates(lambda estimate: estimate.parameter_std, np.nan)
 
     def at_bound(self) -> NDArray[np.bool_]:
-        """(f, d), false where lost."""
-        return self._of_estimates(lambda estimate: estimate.at_bound, False)
+        """(f, d), false where lost, and for angles about an axis of revolution, which go on beyond their bounds."""
+        has_bounds = np.array([one.name not in self.revolution_angles for one in self.model.parameters], dtype=bool)
+        return self._of_estimates(lambda estimate: estimate.at_bound & has_bounds, False)
 
     def _of_estimates(self, value: Callable[[Estimate], NDArray], lost: float | bool) -> NDArray:
         """A value of each estimate's parameters (f, d), ``lost`` where there is none."""

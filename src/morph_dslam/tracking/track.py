@@ -261,8 +261,8 @@ class _Job:
         print("refining what is one over the sequence ...", file=sys.stderr)
         self._placed = []
         for part in begun:
-            known = opened.get(part.name)
-            seen = [keyframe for frame, keyframe in self._seen[part.name] if known is None or frame < known.first]
+            end = opened[part.name].first if part.name in opened else np.inf
+            seen = [keyframe for frame, keyframe in self._seen[part.name] if frame < end]
             self._placed.append(_refined(part, seen, run))
         for folder, part in zip(self._folders, self._placed, strict=True):
             folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
