@@ -34,7 +34,7 @@ TEST_AND_LINT = $(MAKE) --no-print-directory lint > $(VENV)/lint.log 2>&1 & lint
 	$(1) || status=$$?; wait $$lint || status=$$?; cat $(VENV)/lint.log; exit $$status
 
 test: $(INSTALLED)
-	@$(call TEST_AND_LINT,$(PYTEST) -m "not slow")
+	@$(call TEST_AND_LINT,$(PYTEST) -m "not slow" --timeout 1200)
 
 test-all: $(INSTALLED)
 	@$(call TEST_AND_LINT,$(PYTEST))

@@ -19,6 +19,7 @@ from PIL import Image
 from morph_dslam import Board, Camera, load_study, save_model
 from morph_dslam.extend.geometry import RigidTransform, rotation_exp
 from morph_dslam.extend.mechanics import load_mesh
+from tests.support.processes import ended_at_last
 from tests.support.rendered_board import board_image, board_poses
 from tests.support.stretched_block import stretched_block_model
 from tests.support.studio import Client, running_studio, write_part
@@ -271,7 +272,7 @@ def test_without_the_extra_there_is_one_message():
 def test_it_ends_quietly_although_a_page_is_open(tmp_path):
     program = "import sys; from morph_dslam.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "studio", str(tmp_path / "project"), "--port", "0", "--host", "0.0.0.0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with ended_at_last(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)) as process:
         line = process.stdout.readline()
         port, token = re.search(r"http://[^ ]+:(\d+)/\?token=([\w-]+) \(Ctrl-C ends it\)", line).groups()
         statuses, opened = {}, []

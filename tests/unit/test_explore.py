@@ -20,6 +20,7 @@ from morph_dslam.extend.studies import build_rigid
 from morph_dslam.io.access import HOST
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.processes import ended_at_last
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
 
 
@@ -184,7 +185,7 @@ def test_the_command_serves_until_it_is_interrupted(tmp_path):
         "sys.exit(main(sys.argv[1:]))"
     )
     command = [sys.executable, "-c", program, "explore", str(tmp_path / "block.morph"), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with ended_at_last(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)) as process:
         (port,) = re.findall(r"http://127\.0\.0\.1:(\d+)/", process.stdout.readline())
         connection = http.client.HTTPConnection(HOST, int(port), timeout=20)
         connection.request("GET", "/model.json")

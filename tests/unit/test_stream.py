@@ -232,7 +232,7 @@ def test_a_client_that_takes_nothing_does_not_keep_the_stream_from_its_end(publi
         publisher.close()
         assert not publisher.is_watched
         with pytest.raises(ConnectionClosedError):
-            list(stuck)
+            list(iter(lambda: stuck.recv(timeout=60.0), None))
 
 
 def stream_address(publisher, token=None):
@@ -306,6 +306,15 @@ def test_a_token_may_be_kept_from_run_to_run(monkeypatch):
 def test_frames_before_the_scene_are_refused(publisher, model):
     with pytest.raises(StreamError, match="begin"):
         StreamSink([publisher])(tracked_frame(0, 0.0, block=tracked_result(model, 0.1, 0.0)))
+
+
+def test_a_system_that_has_nothing_left_is_one_message(monkeypatch):
+    def exhausted(*_, **__):
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr("morph_dslam.streams.websocket.serve", exhausted)
+    with pytest.raises(StreamError, match=r"cannot be served: .*Too many open files"):
+        WebSocketPublisher()
 
 
 def test_a_port_that_is_taken(publisher):

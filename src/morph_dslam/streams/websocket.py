@@ -100,7 +100,7 @@ class WebSocketPublisher:
     Raises
     ------
     StreamError
-        If the address cannot be taken.
+        If the address cannot be taken, or the system lets nobody listen at it.
     """
 
     def __init__(self, host: str = HOST, port: int = 0) -> None:
@@ -112,9 +112,12 @@ class WebSocketPublisher:
         self._gate = StreamGate(self.token, HOST if self._name == HOST else host, self.port, names)
         self._clients: set[ServerConnection] = set()
         self._ready = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="stream", daemon=True)
+        self._failure: OSError | None = None
+        self._thread = threading.Thread(target=self._run, name="stream", daemon=True)
         self._thread.start()
         self._ready.wait()
+        if self._failure is not None:
+            raise StreamError(f"--stream ws cannot be served: {self._failure}") from self._failure
 
     @property
     def place(self) -> str:
@@ -162,6 +165,18 @@ class WebSocketPublisher:
 
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(changed)
+
+    def _run(self) -> None:
+        """Serve until it ends; where it cannot even begin, who waits for it is told why."""
+        try:
+            asyncio.run(self._serve())
+        except OSError as error:
+            if self._ready.is_set():
+                raise
+            self._socket.close()
+            self._failure = error
+        finally:
+            self._ready.set()
 
     async def _serve(self) -> None:
         self._loop, self._newest = asyncio.get_running_loop(), _Newest()
