@@ -32,6 +32,8 @@ N_SIDES, N_TURNS, N_POINTS, N_DIRECTIONS = 160, 24, 48, 8
 HALF, TOLERANCE, STEP = 2, 2.0, 4
 #: A turned drawing is left where its first points add up to nothing, or some more of them to less than this.
 FEW_POINTS, MORE_POINTS, MORE_GAIN = 6, 12, 3.0
+#: Gains are whole numbers of so many to 1, and are looked at in blocks of so many places.
+PER_GAIN, BLOCK = 40, 64
 #: Window over which chance is measured, pixels of the halved image.
 WINDOW = 65
 #: Apparent diameters tried, over the image's height, and the factor from one to the next.
@@ -94,11 +96,11 @@ class EdgeDrawings:
         return cls(np.array(rotations), np.array(offsets), np.array(normals), np.array(depths))
 
 
-def edge_gains(view: View) -> NDArray[np.float32]:
+def edge_gains(view: View) -> NDArray[np.int8]:
     """By how much an edge of each direction speaks for the object at each pixel (`N_DIRECTIONS`, h / 2, w / 2).
 
-    The log of the likelihood of what is seen there, an edge of that direction or none, on an edge of the object over
-    that in the image around.
+    Over `PER_GAIN`, the log of the likelihood of what is seen there, an edge of that direction or none, on an edge of
+    the object over that in the image around.
     """
     small = cv2.resize(view.normalized, None, fx=1 / HALF, fy=1 / HALF, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 0.8).astype(np.float32)
@@ -113,10 +115,10 @@ def edge_gains(view: View) -> NDArray[np.float32]:
         chance = np.clip(cv2.blur(hit, (WINDOW, WINDOW)), 0.05, 0.95)
         shown = np.maximum(SHOWN, chance)
         gains.append(np.where(hit > 0, np.log(shown / chance), np.log((1.0 - shown) / (1.0 - chance))))
-    return np.asarray(gains, dtype=np.float32)
+    return np.rint(PER_GAIN * np.asarray(gains)).astype(np.int8)
 
 
-def in_phases(gains: NDArray[np.float32], margin: int) -> NDArray[np.float32]:
+def in_phases(gains: NDArray[np.int8], margin: int) -> NDArray[np.int8]:
     """Gains (d, h, w) with a margin of zeros, so that those at every `STEP`-th pixel are neighbours.
 
     Returns
@@ -125,19 +127,19 @@ def in_phases(gains: NDArray[np.float32], margin: int) -> NDArray[np.float32]:
     ``margin`` more than x and y.
     """
     height, width = (int(np.ceil((side + 2 * margin) / STEP)) * STEP for side in gains.shape[1:])
-    wide = np.zeros((len(gains), height, width), np.float32)
+    wide = np.zeros((len(gains), height, width), np.int8)
     wide[:, margin : margin + gains.shape[1], margin : margin + gains.shape[2]] = gains
     split = wide.reshape(len(gains), height // STEP, STEP, width // STEP, STEP)
     return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3))
 
 
-@njit(cache=True, nogil=True, fastmath={"nsz"})
+@njit(cache=True, nogil=True)
 def lay_over(phases, margin, offsets, normals, turns, size, columns, rows, best, which):
     """Lay all drawings, turned, over places of an image, and keep the best of each side at each place.
 
     Parameters
     ----------
-    phases : of `in_phases`: a row of places is added in one go.
+    phases : of `in_phases`: all places from the first to the last one are added in one go.
     margin : of them; no drawing reaches farther.
     offsets : (s, p, 2) of the drawings.
     normals : (s, p) of the drawings.
@@ -145,51 +147,61 @@ def lay_over(phases, margin, offsets, normals, turns, size, columns, rows, best,
     size : of the object, pixels.
     columns : (k,) of the places, over `STEP`, rising in each row.
     rows : (k,) likewise, rising.
-    best : (k, s) sums of gains, filled.
+    best : (k, s) int16 sums of gains, filled.
     which : (k, s) int16 the turn that gives it, filled.
     """
-    n_directions = phases.shape[0]
+    n_directions, _, _, height, width = phases.shape
     n_sides, n_points = offsets.shape[:2]
-    x, y, direction = np.empty(n_points, np.int64), np.empty(n_points, np.int64), np.empty(n_points, np.int64)
-    few, more = np.empty(phases.shape[4], np.float32), np.empty(phases.shape[4], np.float32)
+    flat, start = phases.reshape(-1), np.empty(n_points, np.int64)
+    low = rows[0] * width + columns[0]
+    count = rows[-1] * width + columns[-1] - low + 1
+    place_at = np.full(count, -1)
+    for place in range(len(columns)):
+        place_at[rows[place] * width + columns[place] - low] = place
+    few, more = np.empty(count, np.int16), np.empty(count, np.int16)
     for side in range(n_sides):
         for turn in range(turns):
             angle = 2.0 * np.pi * turn / turns
             c, s = np.cos(angle), np.sin(angle)
             for p in range(n_points):
                 u, v = size * offsets[side, p, 0], size * offsets[side, p, 1]
-                x[p], y[p] = int(np.rint(c * u - s * v)) + margin, int(np.rint(s * u + c * v)) + margin
-                direction[p] = int(np.rint((normals[side, p] + angle) / np.pi * n_directions)) % n_directions
-            first = 0
-            while first < len(columns):
-                last = first
-                while last + 1 < len(columns) and rows[last + 1] == rows[first]:
-                    last += 1
-                row, start, count = rows[first], columns[first], columns[last] - columns[first] + 1
-                few[:count] = 0.0
-                for p in range(FEW_POINTS):
-                    line = phases[direction[p], y[p] % STEP, x[p] % STEP, row + y[p] // STEP]
-                    begin = start + x[p] // STEP
-                    for k in range(count):
-                        few[k] += line[begin + k]
-                more[:count] = few[:count]
-                for p in range(FEW_POINTS, MORE_POINTS):
-                    line = phases[direction[p], y[p] % STEP, x[p] % STEP, row + y[p] // STEP]
-                    begin = start + x[p] // STEP
-                    for k in range(count):
-                        more[k] += line[begin + k]
-                for place in range(first, last + 1):
-                    k = columns[place] - start
-                    if few[k] < 0.0 or more[k] < MORE_GAIN:
+                x, y = int(np.rint(c * u - s * v)) + margin, int(np.rint(s * u + c * v)) + margin
+                direction = int(np.rint((normals[side, p] + angle) / np.pi * n_directions)) % n_directions
+                phase = (direction * STEP + y % STEP) * STEP + x % STEP
+                start[p] = (phase * height + y // STEP) * width + x // STEP + low
+            few[:] = 0
+            _add_lines(flat, start[:FEW_POINTS], few)
+            more[:] = few
+            _add_lines(flat, start[FEW_POINTS:MORE_POINTS], more)
+            for first in range(0, count, BLOCK):
+                if _largest(more[first : first + BLOCK]) < MORE_GAIN * PER_GAIN:
+                    continue
+                for k in range(first, min(first + BLOCK, count)):
+                    place = place_at[k]
+                    if place < 0 or few[k] < 0 or more[k] < MORE_GAIN * PER_GAIN:
                         continue
-                    total = more[k]
+                    total = np.int64(more[k])
                     for p in range(MORE_POINTS, n_points):
-                        total += phases[
-                            direction[p], y[p] % STEP, x[p] % STEP, row + y[p] // STEP, columns[place] + x[p] // STEP
-                        ]
+                        total += flat[start[p] + k]
                     if total > best[place, side]:
                         best[place, side], which[place, side] = total, turn
-                first = last + 1
+
+
+@njit(cache=True, nogil=True)
+def _add_lines(flat, starts, sums):
+    """Add stretches of whole numbers. As slices: an index that might be negative would be looked at one by one."""
+    for start in starts:
+        line = flat[start : start + len(sums)]
+        for k in range(len(sums)):
+            sums[k] += line[k]
+
+
+@njit(cache=True, nogil=True)
+def _largest(values):
+    largest = values[0]
+    for value in values:
+        largest = max(largest, value)
+    return largest
 
 
 @dataclass(frozen=True)
@@ -347,7 +359,7 @@ def hypotheses(
     phases = in_phases(edge_gains(view), margin)
 
     def of_size(size: float) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int16], Array]:
-        best = np.zeros((len(places), len(drawings.rotations)), np.float32)
+        best = np.zeros((len(places), len(drawings.rotations)), np.int16)
         which = np.zeros(best.shape, np.int16)
         lay_over(
             phases,
@@ -362,13 +374,13 @@ def hypotheses(
             which,
         )
         # The best of each side in each square.
-        order = np.argsort(-best, axis=0)[:MOST_OF_SIDE]
+        order = np.argsort(-best, axis=0, kind="stable")[:MOST_OF_SIDE]
         kept = [order[np.unique(cells[order[:, side]], return_index=True)[1], side] for side in range(best.shape[1])]
         sides = np.repeat(np.arange(best.shape[1]), [len(places_kept) for places_kept in kept])
         at = np.concatenate(kept)
-        chosen = np.argsort(-best[at, sides])[:MOST]
+        chosen = np.argsort(-best[at, sides], kind="stable")[:MOST]
         at, sides = at[chosen], sides[chosen]
-        return best[at, sides].astype(float), np.full(len(at), size), sides, which[at, sides], places[at]
+        return best[at, sides] / PER_GAIN, np.full(len(at), size), sides, which[at, sides], places[at]
 
     found = on_all_cores(of_size, sizes.tolist())
     gain, apparent, side, turn, place = (np.concatenate(part) for part in zip(*found, strict=True))
