@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -66,6 +67,11 @@ class PointsOnSurface:
             rows = np.random.default_rng(0).choice(rows, MOST_USED, replace=False)
         return PointsOnSurface(self._points[rows], self._surface, self._n_views)
 
+    @cached_property
+    def _depth(self) -> float:
+        """Their median distance from where they are seen."""
+        return float(np.median(np.linalg.norm(self._points.positions - self._points.viewpoints, axis=1)))
+
     def equations(self, place: SimilarityTransform, about: Array, reach: float) -> tuple[Array, Array]:
         """What they add to the normal equations (7, 7) and (7,) of a step of the place about a point (3,).
 
@@ -73,8 +79,7 @@ class PointsOnSurface:
         """
         if not len(self._points):
             return np.zeros((7, 7)), np.zeros(7)
-        away = np.linalg.norm(self._points.positions - self._points.viewpoints, axis=1)
-        depth = float(np.median(away))
+        depth = self._depth
         width = max(WIDTH * DEPTH_NOISE * depth, WIDTH_PER_PX * reach * self._surface.size * place.scale)
         matrix, right, weights = surface_equations(self._points, self._surface, place, about, width)
         if not weights.any():

@@ -21,19 +21,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
-from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.registration.dense_points import PointsOnSurface
 from morph_dslam.registration.increments import moved_similarity, pose_jacobian, similarity_jacobian
+from morph_dslam.registration.mesh_edges import MeshEdges, see_edges, seen_from
 from morph_dslam.registration.scene import View, camera_from_object
-from morph_dslam.registration.simplified import simplified
-from morph_dslam.render.rasteriser import draw_depth, image_region
 
 Array = NDArray[np.float64]
-#: Cosine of the angle between two triangles from which their edge is seen, points along the edges of the size of the
-#: object, and the factor by which depth is drawn smaller.
-SHARP, SPACING, SHRINK = 0.85, 80, 2
-#: The same cosine, from which on the two triangles lie in one plane.
-FLAT = 1.0 - 1e-9
 #: Change of grey in a pixel that is an edge, and cosine to the direction expected.
 LEAST_EDGE, PARALLEL = 3.0, 0.8
 #: How far to either side edges are searched in turn, pixels.
@@ -50,149 +43,6 @@ NEAR_PX, ASIDE_PX = 2.0, (8.0, 12.0, 16.0)
 SHOWN = 0.8
 #: Fewer points of edges in the images are no evidence.
 FEWEST = 30
-
-
-@dataclass(frozen=True)
-class VisibleEdges:
-    """Edges of a mesh that a view sees.
-
-    Attributes
-    ----------
-    points : (p, 3) object frame, metres.
-    pixels : (p, 2) where they are seen.
-    normals : (p, 2) across them in the image.
-    outline : (p,) whether something else is seen behind, and not another side of the object.
-    """
-
-    points: Array
-    pixels: Array
-    normals: Array
-    outline: NDArray[np.bool_]
-
-
-class MeshEdges:
-    """Points along the edges of a mesh.
-
-    Parameters
-    ----------
-    nodes : (n, 3) metres.
-    triangles : (m, 3) node indices.
-    """
-
-    def __init__(self, nodes: Array, triangles: NDArray[np.int64]) -> None:
-        self.nodes, self.triangles = nodes, triangles
-        #: Nodes and triangles that are drawn, to see what is hidden.
-        self.drawn = simplified(nodes, triangles)
-        self.size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
-        sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        owner = np.repeat(np.arange(len(triangles)), 3)
-        keys = np.sort(sides, axis=1)
-        order = np.lexsort((keys[:, 1], keys[:, 0]))
-        _, first, uses = np.unique(keys[order], axis=0, return_index=True, return_counts=True)
-        #: Whether the surface has an inside, so that its triangles that are turned away are hidden.
-        self._closed = bool((uses == 2).all())
-        ends, one = keys[order][first], owner[order[first]]
-        other = np.where(uses == 2, owner[order[np.minimum(first + 1, len(order) - 1)]], -1)
-        normals = triangle_normals(nodes, triangles)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        # An edge within a plane is never seen.
-        bent = (other < 0) | (np.einsum("ex,ex->e", normals[one], normals[other]) < FLAT)
-        ends, one, other = ends[bent], one[bent], other[bent]
-        length = np.linalg.norm(nodes[ends[:, 1]] - nodes[ends[:, 0]], axis=1)
-        edge, share = _spaced(length, self.size / SPACING)
-        start, self._along = nodes[ends[edge, 0]], (nodes[ends[:, 1]] - nodes[ends[:, 0]])[edge]
-        self._points = start + share[:, None] * self._along
-        one, other = one[edge], other[edge]
-        #: Normals (2, p, 3) of the triangles on both sides, their sum, and how far their planes are from the origin.
-        self._sides = np.stack([normals[one], np.where(other[:, None] >= 0, normals[other], -normals[one])])
-        self._sum, self._away = self._sides.sum(axis=0), np.einsum("kpx,px->kp", self._sides, self._points)
-        self._sharp = np.einsum("px,px->p", *self._sides) < SHARP
-
-    def visible(self, pose: RigidTransform, camera: Camera) -> VisibleEdges:
-        """What a camera sees of them; ``pose`` is camera_from_object, metres."""
-        eye = pose.inverse.translation
-        facing = self._sides @ eye > self._away
-        turns = facing[0] != facing[1]
-        rows = np.flatnonzero(turns | (self._sharp & facing.any(axis=0)))
-        local = pose.apply(self._points[rows])
-        pixels = camera.project(local)
-        seen = self._seen(pose, camera, local, pixels)
-        rows, local, pixels = rows[seen], local[seen], pixels[seen]
-        return VisibleEdges(self._points[rows], pixels, self._normals(rows, pose, camera, local), turns[rows])
-
-    def _normals(self, rows: NDArray[np.int64], pose: RigidTransform, camera: Camera, local: Array) -> Array:
-        """Across the edges, (p, 2). Where a smooth surface turns away, its own normal is across the outline."""
-        ahead = np.einsum("pij,pj->pi", camera.projection_jacobian(local), self._along[rows] @ pose.rotation.T)
-        across = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-        smooth = ~self._sharp[rows]
-        across[smooth] = (self._sum[rows[smooth]] @ pose.rotation.T)[:, :2]
-        return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-
-    def depth(self, pose: RigidTransform, camera: Camera, shrink: int = 1) -> Array:
-        """The object's depth in every pixel of a camera with so many times fewer of them; inf beside it."""
-        whole = np.full((camera.height // shrink, camera.width // shrink), np.inf)
-        drawn, left, top = self._drawn(pose, camera, shrink)
-        whole[top : top + drawn.shape[0], left : left + drawn.shape[1]] = drawn
-        return whole
-
-    def _drawn(self, pose: RigidTransform, camera: Camera, shrink: int) -> tuple[NDArray[np.float32], int, int]:
-        """The depth of `depth` where the object is, and the region's left and top."""
-        nodes, triangles = pose.apply(self.drawn[0]), self.drawn[1]
-        pixels = (camera.project(nodes) + 0.5) / shrink - 0.5
-        region = image_region(pixels, camera.height // shrink, camera.width // shrink)
-        if region is None or nodes[:, 2].min() <= 0.0:
-            return np.empty((0, 0), np.float32), 0, 0
-        top, left = region[0].start, region[1].start
-        size = region[0].stop - top, region[1].stop - left
-        pixels -= [left, top]
-        return (
-            draw_depth(np.ascontiguousarray(pixels), nodes[:, 2].copy(), triangles, self._closed, *size)[1],
-            left,
-            top,
-        )
-
-    def _seen(self, pose: RigidTransform, camera: Camera, local: Array, pixels: Array) -> NDArray[np.bool_]:
-        """Which points (p,) are in the image, and not behind the object."""
-        small = (pixels + 0.5) / SHRINK - 0.5
-        size = camera.width // SHRINK, camera.height // SHRINK
-        return not_behind(*self._drawn(pose, camera, SHRINK), *size, small, local[:, 2], 0.01 * self.size)
-
-
-@njit(cache=True, nogil=True)
-def not_behind(depth, left, top, width, height, pixels, depths, tolerance):
-    """Which points (p,) are at least two pixels inside of an image, and not behind what is drawn around them.
-
-    Parameters
-    ----------
-    depth : (h, w) drawn, inf where nothing is.
-    left, top : where this is in the image.
-    width, height : of the image.
-    pixels : (p, 2) of the points, NaN behind the camera.
-    depths : (p,) of the points.
-    tolerance : by which a point may be behind the farthest of the pixels around it.
-    """
-    seen = np.zeros(len(pixels), dtype=np.bool_)
-    for p in range(len(pixels)):
-        if not (np.isfinite(pixels[p, 0]) and np.isfinite(pixels[p, 1])):
-            continue
-        column, row = int(np.rint(pixels[p, 0])), int(np.rint(pixels[p, 1]))
-        if column < 2 or row < 2 or column >= width - 2 or row >= height - 2:
-            continue
-        farthest = 0.0
-        for y in range(row - top - 1, row - top + 2):
-            for x in range(column - left - 1, column - left + 2):
-                inside = 0 <= x < depth.shape[1] and 0 <= y < depth.shape[0]
-                farthest = max(farthest, depth[y, x]) if inside else np.inf
-        seen[p] = depths[p] <= farthest + tolerance
-    return seen
-
-
-def _spaced(lengths: Array, spacing: float) -> tuple[NDArray[np.int64], Array]:
-    """Edges (p,) and shares of their lengths (p,) at equal distances along all of them, one after the other."""
-    total = np.concatenate([[0.0], np.cumsum(lengths)])
-    places = np.arange(0.5 * spacing, total[-1], spacing)
-    edges = np.searchsorted(total, places, side="right") - 1
-    return edges, (places - total[edges]) / np.maximum(lengths[edges], 1e-300)
 
 
 @njit(cache=True, nogil=True)
@@ -246,6 +96,8 @@ def find_edges(slope_x, slope_y, pixels, normals, reach, least):
 def edge_equations(points, turned_about, normals, offsets, reach, intrinsics):
     """Normal equations of a pose's step and of the image's own shift by edges found along normals.
 
+    Edges that were not found, at NaN, do not count.
+
     Parameters
     ----------
     points : (p, 3) of the edges, in the camera.
@@ -260,11 +112,13 @@ def edge_equations(points, turned_about, normals, offsets, reach, intrinsics):
     Matrix and right side (7, 7) of the pose's step, the latter as last row and column; the same against the shift
     (7, 2); and the shift's matrix (2, 2).
     """
-    count, width = len(points), max(0.5 * reach, 1.5)
+    count, width = np.isfinite(offsets).sum(), max(0.5 * reach, 1.5)
     # Neighbours share their errors: a view's edges count as so many independent points.
     independent = min(1.0, INDEPENDENT / max(count, 1)) / EDGE_PX**2
     own, by_shift, shift, row = np.zeros((7, 7)), np.zeros((7, 2)), np.eye(2) / SHIFT_PX**2, np.empty(7)
-    for p in range(count):
+    for p in range(len(points)):
+        if not np.isfinite(offsets[p]):
+            continue
         x, y, z = points[p]
         a, b = normals[p, 0] * intrinsics[0] / z, normals[p, 1] * intrinsics[1] / z
         c = -(a * x + b * y) / z
@@ -281,6 +135,34 @@ def edge_equations(points, turned_about, normals, offsets, reach, intrinsics):
             for j in range(2):
                 shift[i, j] += weight * normals[p, i] * normals[p, j]
     return own, by_shift, shift
+
+
+@njit(cache=True, nogil=True)
+def view_equations(edges, rotation, translation, intrinsics, width, height, slope_x, slope_y, reach):
+    """Normal equations (7, 7) of a pose's step, whose right side is the last row and column; zero if a view shows
+    too few edges. The view's own shift is eliminated.
+
+    Parameters
+    ----------
+    edges : `EdgePoints` of the object.
+    rotation, translation, intrinsics, width, height : of the view, as of `seen_from`.
+    slope_x, slope_y : (h, w) change of grey in a pixel to the right and downwards.
+    reach : pixels to search to either side.
+    """
+    _, points, pixels, normals, _ = see_edges(edges, rotation, translation, intrinsics, width, height)
+    if len(points) < FEWEST:
+        return np.zeros((7, 7))
+    offsets = find_edges(slope_x, slope_y, pixels, normals, reach, LEAST_EDGE)
+    if np.isfinite(offsets).sum() < FEWEST:
+        return np.zeros((7, 7))
+    own, by_shift, shift = edge_equations(points, translation, normals, offsets, reach, intrinsics)
+    determinant = shift[0, 0] * shift[1, 1] - shift[0, 1] * shift[1, 0]
+    for i in range(7):
+        first = (shift[1, 1] * by_shift[i, 0] - shift[0, 1] * by_shift[i, 1]) / determinant
+        second = (shift[0, 0] * by_shift[i, 1] - shift[1, 0] * by_shift[i, 0]) / determinant
+        for j in range(7):
+            own[i, j] -= first * by_shift[j, 0] + second * by_shift[j, 1]
+    return own
 
 
 @dataclass(frozen=True)
@@ -412,9 +294,7 @@ class EdgeImages:
         near = None if points is None else points.near(start)
         covariance = np.zeros((7, 7))
         for reach in reaches:
-            poses = [camera_from_object(view, place) for view in self.views]
-            seen = [edges.visible(pose, self.camera) for pose in poses]
-            matrix, right = self._equations(seen, poses, place, reach, centre)
+            matrix, right = self._equations(edges, place, reach, centre)
             for click in clicks:
                 add_clicks(matrix, right, click, place, centre, self.camera)
             if near is not None:
@@ -431,29 +311,14 @@ class EdgeImages:
         return place, covariance * np.outer(units, units)
 
     def _equations(
-        self,
-        visible: Sequence[VisibleEdges],
-        poses: Sequence[RigidTransform],
-        place: SimilarityTransform,
-        reach: float,
-        centre: Array,
+        self, edges: MeshEdges, place: SimilarityTransform, reach: float, centre: Array
     ) -> tuple[Array, Array]:
         """Normal matrix (7, 7) and right side (7,), the keyframes' own shifts eliminated."""
         matrix, right = np.zeros((7, 7)), np.zeros(7)
-        for seen, pose, slopes in zip(visible, poses, self.slopes, strict=True):
-            if len(seen.points) < FEWEST:
-                continue
-            offsets = find_edges(slopes[0], slopes[1], seen.pixels, seen.normals, float(reach), LEAST_EDGE)
-            found = np.isfinite(offsets)
-            if found.sum() < FEWEST:
-                continue
-            points = pose.apply(seen.points[found])
-            own, by_shift, shift = edge_equations(
-                points, pose.translation, seen.normals[found], offsets[found], float(reach), self.camera.intrinsics
-            )
+        for view, slopes in zip(self.views, self.slopes, strict=True):
+            pose = camera_from_object(view, place)
+            own = view_equations(edges.arrays, *seen_from(pose, self.camera), *slopes, float(reach))
             by_place = similarity_jacobian(pose, place, centre)
-            # The keyframe's own shift is eliminated.
-            own -= by_shift @ np.linalg.solve(shift, by_shift.T)
             matrix += by_place.T @ own[:6, :6] @ by_place
             right += by_place.T @ own[:6, 6]
         return matrix, right
@@ -474,11 +339,11 @@ class EdgeImages:
             def near(
                 away: float,
                 pixels: Array = pixels,
-                seen: VisibleEdges = seen,
+                normals: Array = seen.normals,
                 slopes: tuple[NDArray[np.float32], NDArray[np.float32]] = slopes,
             ) -> Array:
-                places = pixels + away * seen.normals
-                return np.isfinite(find_edges(slopes[0], slopes[1], places, seen.normals, NEAR_PX, LEAST_EDGE))
+                found = find_edges(*slopes, pixels + away * normals, normals, NEAR_PX, LEAST_EDGE)
+                return np.isfinite(found)
 
             on.append(near(0.0))
             chance.append(np.mean([near(away) for away in aside], axis=0))
@@ -504,13 +369,20 @@ class EdgeImages:
         )
 
 
-def _own_shift(offsets: Array, normals: Array) -> Array:
-    """The shift (2,) of all points that brings most of them onto the edges found, within `SHIFT_PX` or so."""
-    found = np.isfinite(offsets)
-    shift, away, across = np.zeros(2), offsets[found], normals[found]
+@njit(cache=True, nogil=True)
+def _own_shift(offsets, normals):
+    """The shift (2,) of all points that brings most of them onto the edges found (p,), within `SHIFT_PX` or so."""
+    shift = np.zeros(2)
     for _ in range(5):
-        left = away - across @ shift
-        weights = 1.0 / (1.0 + (left / 1.5) ** 2) ** 2
-        matrix = across.T @ (weights[:, None] * across) + np.eye(2) * 20.0 / SHIFT_PX**2
-        shift = np.asarray(np.linalg.solve(matrix, across.T @ (weights * away)), dtype=np.float64)
+        xx = yy = 20.0 / SHIFT_PX**2
+        xy = x = y = 0.0
+        for p in range(len(offsets)):
+            if not np.isfinite(offsets[p]):
+                continue
+            a, b = normals[p]
+            weight = 1.0 / (1.0 + ((offsets[p] - a * shift[0] - b * shift[1]) / 1.5) ** 2) ** 2
+            xx, xy, yy = xx + weight * a * a, xy + weight * a * b, yy + weight * b * b
+            x, y = x + weight * a * offsets[p], y + weight * b * offsets[p]
+        determinant = xx * yy - xy * xy
+        shift[0], shift[1] = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
     return shift

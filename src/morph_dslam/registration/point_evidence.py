@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.scene import View
 from morph_dslam.registration.search_space import plane_points
-from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.rasteriser import draw_depth
 
 Array = NDArray[np.float64]
 #: A point that the object would occlude counts against it as much as so many that it explains.
@@ -91,20 +92,11 @@ def gather_evidence(
     world = world_from_object.apply(nodes)
     for view in views:
         local = view.camera_from_world.apply(world)
-        buffers = rasterise(small.project(local), local[:, 2], triangles, small.height, small.width)
-        depth = view.camera_from_world.apply(positions[view.point_ids])[:, 2]
-        columns, rows = np.rint((view.pixels + 0.5) / SHRINK - 0.5).astype(np.int64).T
-        inside = (columns >= 0) & (columns < small.width) & (rows >= 0) & (rows < small.height)
-        drawn = np.full(len(depth), np.inf)
-        drawn[inside] = buffers.depth[rows[inside], columns[inside]]
-        allowed = np.maximum(tolerance, noise * depth)
-        # A grazing surface changes its depth within a pixel: what is occluded must be so by more.
-        away = np.abs(depth - drawn) / allowed
-        votes[0, view.point_ids] += away <= WIDTHS[0]
-        closeness[view.point_ids] += np.mean([away <= width for width in WIDTHS], axis=0)
-        votes[1, view.point_ids] += drawn < depth - 4.0 * allowed
-        votes[2, view.point_ids] += np.isfinite(drawn) & (drawn > depth + 4.0 * allowed)
-        thickness = max(thickness, 2.0 * noise * float(np.median(depth)) if len(depth) else 0.0)
+        drawn = draw_depth(small.project(local), local[:, 2].copy(), triangles, False, small.height, small.width)[1]
+        depths = view.camera_from_world.apply(positions[view.point_ids])[:, 2].copy()
+        _compare(drawn, view.pixels, depths, view.point_ids, tolerance, noise, votes, closeness)
+        if noise > 0.0 and len(depths):
+            thickness = max(thickness, 2.0 * noise * float(np.median(depths)))
     explained, occluded = votes[0] > votes[1], votes[1] > votes[0]
     solid = explained.copy()
     found = np.flatnonzero(explained)
@@ -113,6 +105,39 @@ def gather_evidence(
     return PointEvidence(
         explained, occluded, solid, votes[2] > votes[0] + votes[1], closeness / np.maximum(votes[0], 1)
     )
+
+
+@njit(cache=True, nogil=True)
+def _compare(drawn, pixels, depths, ids, tolerance, noise, votes, closeness):
+    """Count each of a view's points as explained, occluded or hidden by the object, and how near it is.
+
+    Parameters
+    ----------
+    drawn : (h, w) depth of the object, inf beside it.
+    pixels : (k, 2) of the points, `SHRINK` times larger.
+    depths : (k,) of the points.
+    ids : (k,) their numbers.
+    tolerance, noise : see `gather_evidence`.
+    votes : (3, n) counted up.
+    closeness : (n,) likewise.
+    """
+    height, width = drawn.shape
+    for p in range(len(depths)):
+        column, row = np.rint((pixels[p, 0] + 0.5) / SHRINK - 0.5), np.rint((pixels[p, 1] + 0.5) / SHRINK - 0.5)
+        if not (column >= 0.0 and column < width and row >= 0.0 and row < height):
+            continue
+        there, depth, point = drawn[int(row), int(column)], depths[p], ids[p]
+        if not np.isfinite(there):
+            continue
+        allowed = max(tolerance, noise * depth)
+        # A grazing surface changes its depth within a pixel: what is occluded must be so by more.
+        away, near = abs(depth - there) / allowed, 0
+        for width_allowed in WIDTHS:
+            near += away <= width_allowed
+        votes[0, point] += away <= WIDTHS[0]
+        votes[1, point] += there < depth - 4.0 * allowed
+        votes[2, point] += there > depth + 4.0 * allowed
+        closeness[point] += near / len(WIDTHS)
 
 
 def _shrunk(camera: Camera) -> Camera:

@@ -379,20 +379,36 @@ def _patch(carried, shown, column, row, half, xs, ys, values, slopes):
 
 
 @njit(cache=True, nogil=True)
-def _sample_patch(image, xs, ys, x, y, count, seen):
-    """Grey levels of a displaced patch into ``seen``; whether all of it is inside the image."""
+def _sample_patch(image, xs, ys, x, y, count, lines, seen):
+    """Grey levels of a displaced patch into ``seen``; whether all of it is inside the image.
+
+    All pixels are displaced by the same part of a pixel: the rows are interpolated once, into the scratch ``lines``.
+    """
     height, width = image.shape
+    left, right, top, bottom = xs[:count].min(), xs[:count].max(), ys[0], ys[count - 1]
+    if left + x < 1.0 or top + y < 1.0 or right + x >= width - 2 or bottom + y >= height - 2:
+        return False
+    x0, y0, wide = int(np.floor(x)), int(np.floor(y)), right - left + 1
     across, along = np.empty(4), np.empty(4)
+    _cubic(x - x0, across)
+    _cubic(y - y0, along)
+    for row in range(bottom - top + 4):
+        # Slices, whose indices begin at zero, are what the compiler vectorizes.
+        pixels, line = image[top + y0 - 1 + row, left + x0 - 1 : right + x0 + 3], lines[row]
+        for k in range(wide):
+            first, second = across[0] * pixels[k], across[1] * pixels[k + 1]
+            line[k] = first + second + across[2] * pixels[k + 2] + across[3] * pixels[k + 3]
     for i in range(count):
-        u, v = xs[i] + x, ys[i] + y
-        if u < 1.0 or v < 1.0 or u >= width - 2 or v >= height - 2:
-            return False
-        seen[i] = _sample(image, u, v, across, along)
+        row, column = ys[i] - top, xs[i] - left
+        value = 0.0
+        for j in range(4):
+            value += along[j] * lines[row + j, column]
+        seen[i] = value
     return True
 
 
 @njit(cache=True, nogil=True)
-def _align(image, xs, ys, values, slopes, count, seen):
+def _align(image, xs, ys, values, slopes, count, lines, seen):
     """Displacement and correlation of one patch, whose values and slopes have no mean."""
     a = b = c = power = 0.0
     for i in range(count):
@@ -405,7 +421,7 @@ def _align(image, xs, ys, values, slopes, count, seen):
         return 0.0, 0.0, -1.0
     x = y = 0.0
     for _ in range(ITERATIONS):
-        if not _sample_patch(image, xs, ys, x, y, count, seen):
+        if not _sample_patch(image, xs, ys, x, y, count, lines, seen):
             break
         mean = seen[:count].mean()
         both = own = 0.0
@@ -449,8 +465,8 @@ def align_patches(carried, shown, image, centres, half):
     """
     side = (2 * half + 1) ** 2
     moves, alike = np.zeros((len(centres), 2)), np.full(len(centres), -1.0)
-    xs, ys, values = np.empty(side), np.empty(side), np.empty(side)
-    slopes, seen = np.empty((side, 2)), np.empty(side)
+    xs, ys, values = np.empty(side, np.int64), np.empty(side, np.int64), np.empty(side)
+    slopes, lines, seen = np.empty((side, 2)), np.empty((2 * half + 4, 2 * half + 1)), np.empty(side)
     for p in range(len(centres)):
         column, row = int(np.rint(centres[p, 0])), int(np.rint(centres[p, 1]))
         count = _patch(carried, shown, column, row, half, xs, ys, values, slopes)
@@ -459,5 +475,5 @@ def align_patches(carried, shown, image, centres, half):
         values[:count] -= values[:count].mean()
         slopes[:count, 0] -= slopes[:count, 0].mean()
         slopes[:count, 1] -= slopes[:count, 1].mean()
-        moves[p, 0], moves[p, 1], alike[p] = _align(image, xs, ys, values, slopes, count, seen)
+        moves[p, 0], moves[p, 1], alike[p] = _align(image, xs, ys, values, slopes, count, lines, seen)
     return moves, alike

@@ -20,9 +20,10 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.registration.dense_points import DEPTH_NOISE, PointsOnSurface, with_dense_points
-from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, MeshEdges, Sighting
+from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, Sighting
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
+from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes

@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
-from morph_dslam.registration.edges import LEAST_EDGE, SHOWN, MeshEdges
+from morph_dslam.registration.edges import LEAST_EDGE, SHOWN
+from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.scene import HasPose, MapPoints, View
 from morph_dslam.threads import on_all_cores
 
