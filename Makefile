@@ -25,6 +25,8 @@ demo: $(INSTALLED)
 # that they begin, wherever Python is asked to write none, and outlives `make clean`.
 COMPILED := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba
 PYTEST := $(COMPILED) $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+# A test that takes so many seconds hangs: it fails, and where each of its threads stands is printed.
+NONE_HANGS := -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true --max-worker-restart 1
 
 # `morph doctor` compiles the inner loops of tracking once, before two processes would each do so. Lint runs beside it and
 # the tests, which leave a core free now and then; what it finds is printed after them.
@@ -34,7 +36,7 @@ TEST_AND_LINT = $(MAKE) --no-print-directory lint > $(VENV)/lint.log 2>&1 & lint
 	$(1) || status=$$?; wait $$lint || status=$$?; cat $(VENV)/lint.log; exit $$status
 
 test: $(INSTALLED)
-	@$(call TEST_AND_LINT,$(PYTEST) -m "not slow" --timeout 1200)
+	@$(call TEST_AND_LINT,$(PYTEST) -m "not slow" $(NONE_HANGS))
 
 test-all: $(INSTALLED)
 	@$(call TEST_AND_LINT,$(PYTEST))

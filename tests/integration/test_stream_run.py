@@ -8,6 +8,7 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam.cli.app import main
+from morph_dslam.errors import StreamError
 from morph_dslam.extend.streams import StreamSink
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
@@ -97,6 +98,19 @@ def test_a_live_run_tells_when_frames_were_captured(recording, tmp_path, capsys)
     assert captured == sorted(captured)
     assert captured[-1] < time.time()
     assert {message["objects"][0]["status"] for message in frames} == {"tracked"}
+
+
+def test_a_stream_that_fails_at_the_end_loses_no_result(recording, tmp_path, monkeypatch, refused):
+    def fails(publisher):
+        raise StreamError("the viewer has gone")
+
+    monkeypatch.setattr(WebSocketPublisher, "close", fails)
+    message = refused(
+        "track", recording / "frames", "--model", recording / "sheet.morph", "--camera", recording / "camera.yaml",
+        "--landmarks", recording / "landmarks.csv", "-o", tmp_path / "run", "--no-video", "--stream", "ws:0",
+    )  # fmt: skip
+    assert message == "morph: the viewer has gone"
+    assert md.load_run(tmp_path / "run").tracked.sum() == len(TIMES)
 
 
 class Awaited:

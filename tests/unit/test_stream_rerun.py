@@ -1,5 +1,7 @@
 """Streams to rerun: what a recording holds, read back by rerun's own reader."""
 
+import socket
+
 import cv2
 import numpy as np
 import pytest
@@ -111,6 +113,23 @@ def test_the_image_is_that_of_the_pinhole(tmp_path):
         weights = shown * near
         centre = np.array([(weights * cols).sum(), (weights * rows).sum()]) / weights.sum()
         np.testing.assert_allclose(centre, [u, v], atol=0.3)
+
+
+def test_a_viewer_that_is_not_there_is_told_at_once():
+    with socket.create_server(("127.0.0.1", 0)) as viewer:
+        place = f"rerun+http://127.0.0.1:{viewer.getsockname()[1]}/proxy"
+    with pytest.raises(StreamError, match=r"no viewer answers at .*start `rerun` there first"):
+        StreamSink([f"rerun:{place}"])
+
+
+def test_frames_that_do_not_arrive_are_told_at_the_end(tmp_path, monkeypatch):
+    def fails(recording, *, timeout_sec):
+        raise RuntimeError("the disk is full")
+
+    monkeypatch.setattr("rerun.RecordingStream.flush", fails)
+    streams = StreamSink([f"rerun:{tmp_path / 'run.rrd'}"])
+    with pytest.raises(StreamError, match=r"run\.rrd did not get all frames: the disk is full"):
+        streams.close()
 
 
 def test_places_that_are_none(tmp_path, refused):

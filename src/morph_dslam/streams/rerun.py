@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -23,6 +25,8 @@ JPEG_QUALITY = 80
 MOST_WAITING = 8
 #: Addresses of a viewer that runs elsewhere.
 VIEWER = "rerun+http"
+#: Seconds that a viewer has to answer, and at the end to take what is left.
+LONGEST_ANSWER, LAST_SECONDS = 5.0, 10.0
 _LEVELS = {"tracked": "INFO", "hidden": "WARN", "lost": "ERROR"}
 
 
@@ -36,13 +40,14 @@ class RerunPublisher:
     Raises
     ------
     StreamError
-        If the file cannot be written, or no viewer can be started.
+        If the file cannot be written, no viewer can be started, or none answers.
     """
 
     def __init__(self, where: str) -> None:
         self._where, self._recording = where, rr.RecordingStream("morph-dslam")
         try:
             if where.startswith(VIEWER):
+                _check_viewer(where)
                 self._recording.connect_grpc(where, default_blueprint=_layout())
             elif where:
                 Path(where).open("wb").close()  # what is wrong with it is said in Python's words
@@ -90,14 +95,18 @@ class RerunPublisher:
         self._waiting.append(self._pool.submit(self._log_frame, message))
 
     def close(self) -> None:
-        """Log what is left, and end the recording."""
+        """Log what is left, and end the recording; StreamError if not all of it arrived."""
         try:
             while self._waiting:
                 self._waiting.popleft().result()
         finally:
             self._pool.shutdown()
-            self._recording.flush()
-            self._recording.disconnect()
+            try:
+                self._recording.flush(timeout_sec=LAST_SECONDS)
+            except RuntimeError as error:
+                raise StreamError(f"{self.place} did not get all frames: {error}") from error
+            finally:
+                self._recording.disconnect()
 
     def _log_frame(self, message: FrameMessage) -> None:
         assert self._scene is not None
@@ -138,6 +147,19 @@ class RerunPublisher:
         if self._texts.get(name) != now.text:
             self._texts[name] = now.text
             recording.log(f"status/{name}", rr.TextLog(now.text, level=_LEVELS[now.status]))
+
+
+def _check_viewer(address: str) -> None:
+    """StreamError if nobody listens there: rerun would find out at the end only."""
+    parts = urlsplit(address)
+    if not (parts.hostname and parts.port):
+        return
+    try:
+        socket.create_connection((parts.hostname, parts.port), timeout=LONGEST_ANSWER).close()
+    except OSError as error:
+        raise StreamError(
+            f"no viewer answers at {address} ({error.strerror or error}): start `rerun` there first"
+        ) from error
 
 
 def _rest(part: ObjectInfo) -> rr.Mesh3D:

@@ -84,6 +84,8 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
     MorphError
         If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError, MapError), or
         options make no sense together or with the inputs, or a run folder holds a run already (TrackingError).
+    StreamError
+        If a stream cannot be opened; or did not get all frames, after the run folders were written.
     """
     with ExitStack() as stack:
         run, source, placed = prepare(run, stack)
@@ -92,8 +94,10 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
         try:
             job.run()
         finally:
-            job.end_streams()
-            summaries = [job.write(number, tell) for number in range(len(placed))]
+            try:
+                job.end_streams()
+            finally:
+                summaries = [job.write(number, tell) for number in range(len(placed))]
     return summaries[0]
 
 
