@@ -213,7 +213,7 @@ class CoupledSet:
     def held_modes(self, modes: Array) -> Array:
         """What is held (k, 6) of rigid ``modes`` (3, n_scalar, 6) of the body."""
         columns = self.columns(np.zeros(MOTIONS)).T
-        motions = np.linalg.lstsq(columns, modes[:, self.dofs].reshape(-1, MOTIONS))[0].astype(np.float64)
+        motions = np.linalg.lstsq(columns, modes[:, self.dofs].reshape(-1, MOTIONS), rcond=None)[0].astype(np.float64)
         motions[3:] *= np.abs(self._arms()).max()
         return motions[self.held]
 
