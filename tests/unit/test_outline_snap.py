@@ -46,10 +46,7 @@ def test_the_outline_takes_out_most_of_what_clicks_are_off_by():
         in_deviations.append(pose_and_parameter_errors(snapped, truth))
     assert np.mean(before) > 3.0
     assert np.mean(after) < 0.2 * np.mean(before)
-    of_frames = np.sqrt(np.mean(np.square(in_deviations), axis=1))
-    assert 0.5 < np.median(of_frames) < 1.6
-    # One frame of the eight errs by 3 to 4 of its deviations: how far depends on the version of OpenCV.
-    assert np.sort(of_frames)[-2] < 2.0
+    assert 0.5 < np.sqrt(np.mean(np.square(in_deviations))) < 1.6
 
 
 def with_margin(margin):

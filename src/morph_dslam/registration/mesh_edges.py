@@ -132,14 +132,22 @@ def seen_from(pose: RigidTransform, camera: Camera) -> tuple[Array, Array, Array
 
 
 @njit(cache=True, nogil=True)
+def _dot(a, b):
+    """Scalar product of two vectors (3,), without a call of the linear algebra."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True)
+def _turned(rotation, vector):
+    """A vector (3,) after a rotation."""
+    return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
+
+
+@njit(cache=True, nogil=True)
 def _moved(rotation, translation, point):
     """A point (3,) after a rotation and a translation."""
-    x, y, z = point
-    return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0],
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1],
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2],
-    )
+    x, y, z = _turned(rotation, point)
+    return x + translation[0], y + translation[1], z + translation[2]
 
 
 @njit(cache=True, nogil=True)
@@ -185,16 +193,10 @@ def see_edges(edges, rotation, translation, intrinsics, width, height):
     count, k = len(edges.points), 0
     rows, turned = np.empty(count, np.int64), np.empty(count, np.bool_)
     local, pixels, normals = np.empty((count, 3)), np.empty((count, 2)), np.empty((count, 2))
-    eye = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            eye[i] -= rotation[j, i] * translation[j]
+    eye = _turned(-rotation.T, translation)
     for p in range(count):
-        over = np.zeros(2)
-        for side in range(2):
-            for i in range(3):
-                over[side] += edges.sides[side, p, i] * eye[i]
-        first, second = over[0] > edges.away[0, p], over[1] > edges.away[1, p]
+        first = _dot(edges.sides[0, p], eye) > edges.away[0, p]
+        second = _dot(edges.sides[1, p], eye) > edges.away[1, p]
         if first == second and not (edges.sharp[p] and first):
             continue
         x, y, z = _moved(rotation, translation, edges.points[p])
@@ -228,14 +230,15 @@ def _is_ahead(depth, left, top, width, height, u, v, nearest):
 @njit(cache=True, nogil=True)
 def _across(edges, p, rotation, fx, fy, local, normal):
     """The direction across an edge in the image. Where a smooth surface turns away, its own normal is across."""
-    still = np.zeros(3)
     if edges.sharp[p]:
-        x, y, z = _moved(rotation, still, edges.along[p])
+        x, y, z = _turned(rotation, edges.along[p])
         ahead_u = fx * (x - local[0] / local[2] * z) / local[2]
         ahead_v = fy * (y - local[1] / local[2] * z) / local[2]
         normal[0], normal[1] = -ahead_v, ahead_u
     else:
-        normal[0], normal[1], _ = _moved(rotation, still, edges.sides[0, p] + edges.sides[1, p])
+        one, other = edges.sides[0, p], edges.sides[1, p]
+        normal[0] = _dot(rotation[0], one) + _dot(rotation[0], other)
+        normal[1] = _dot(rotation[1], one) + _dot(rotation[1], other)
     length = max(np.sqrt(normal[0] ** 2 + normal[1] ** 2), 1e-300)
     normal[0], normal[1] = normal[0] / length, normal[1] / length
 

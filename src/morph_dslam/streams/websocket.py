@@ -167,7 +167,7 @@ class WebSocketPublisher:
             self._loop.call_soon_threadsafe(changed)
 
     def _run(self) -> None:
-        """Serve until it ends; where it cannot even begin, who waits for it is told why."""
+        """Serve until it ends; keep the error that did not let it begin, for the thread that waits."""
         try:
             asyncio.run(self._serve())
         except OSError as error:
