@@ -8,6 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from morph_dslam import Camera, build, make_study
 from morph_dslam.cli import app as cli
@@ -22,9 +23,17 @@ from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter, load_model, save_model
+from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.model.reduced_model import REACTION, spread_over
-from morph_dslam.model.unknown_loads import LOADS, with_unknown_loads
+from morph_dslam.model.unknown_loads import LOADS, node_areas, with_unknown_loads
 from morph_dslam.studies.build import build_warnings
+from morph_dslam.tracking.compact_loads import (
+    LoadCovariance,
+    SeenLoads,
+    log_evidence,
+    spot_displacements,
+    spot_variances,
+)
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State
 from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
 from morph_dslam.tracking.reactions import Reactions
@@ -133,17 +142,108 @@ def test_terms_of_the_prior_agree_with_differences(loaded):
     assert np.linalg.eigvalsh(hessian[1:, 1:]).min() > 0.0
 
 
-def test_work_scales_of_loads_that_are_not_there_vanish(loaded):
-    prior = LoadPrior(loaded.energy, LoadOptions())
-    at, covariance = np.zeros(26), np.diag([1.0, *np.full(25, 1e-6)])
-    at[5] = 0.05
-    for _ in range(60):
-        prior.learn(at, covariance, 0.3)
-    assert prior.work[4] == pytest.approx(0.05**2 + 1e-6, rel=0.01)
-    assert np.delete(prior.work, 4).max() < 0.03 * prior.work[4]
-    stated = LoadPrior(loaded.energy, LoadOptions(work=1e-3))
-    stated.learn(at, covariance, 0.3)
-    np.testing.assert_array_equal(stated.work, np.full(25, 1e-3))
+def test_a_stated_work_scale_stays(loaded):
+    prior = LoadPrior(loaded.energy, LoadOptions(work=1e-3))
+    at = np.array([300.0, *np.full(25, 0.02)])
+    prior.learn(at, np.diag([1.0, *np.full(25, 1e-6)]), 0.3)
+    root, _ = loaded.energy.loads.root(at[:1])
+    np.testing.assert_allclose(prior.covariance.inverse, root @ root / 1e-3, rtol=1e-8, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def displacements(loaded):
+    return spot_displacements(loaded.energy.model, loaded.energy.loads)
+
+
+def test_spots_do_the_work_that_loads_do_on_what_they_cause(loaded, displacements):
+    """Reciprocity: finite elements solved with the pressure of a spot, whose displacement each load works on."""
+    loads, model, problem = loaded.energy.loads, loaded.energy.model, make_study(STUDY).problem()
+    assert displacements.shape == (25, 3 * len(loads.nodes))
+    surface, tangent = (
+        problem.loaded_surface("z_max", inward=True),
+        problem.linearise(problem.initial_state().dofs, [0]),
+    )
+    positions = model.nodes[loads.nodes]
+    places = positions[farthest_points(positions, len(positions))]
+    spot = np.linalg.norm(places[:, :2] - 0.03, axis=1).argmin()
+    # Of the widest spots, three times as wide as the nodes are apart.
+    shape = np.exp(-0.5 * (np.linalg.norm(model.nodes[surface.on_surface] - places[spot], axis=1) / 0.0225) ** 2)
+    coefficients = np.linalg.lstsq(surface.at_nodes[surface.on_surface].toarray(), shape, rcond=None)[0][None, None]
+    force = np.linalg.norm(surface.resultants(coefficients, model.nodes)[0, :3])
+    moved = problem.nodal_displacement(tangent.solve(surface.loads(coefficients))[0] / force)[loads.nodes]
+    work = np.einsum("n,ncm,nc->m", node_areas(model, loads.nodes), loads.tractions, moved)
+    # A spot's force points outwards, along the normal, and so against the pressure.
+    found = displacements[:, 2 * len(loads.nodes) + spot]
+    np.testing.assert_allclose(found, -work, atol=0.05 * np.abs(work).max())
+
+
+def _estimated(information, gradient, prior):
+    """The information and the loads of a frame that measures these, with this prior times 0.7 beside."""
+    known = information + 0.7 * prior.inverse
+    return known, np.linalg.solve(known, gradient)
+
+
+def test_what_a_frame_shows_is_separated_from_the_prior(loaded, displacements):
+    """Twelve combinations of 25 loads are measured; of the rest the frame shows nothing."""
+    rng, (root, _) = np.random.default_rng(2), loaded.energy.loads.root(loaded.default[:1])
+    compliance = root @ root
+    rows = 300.0 * rng.standard_normal((12, 25))
+    truth = 0.05 * rng.standard_normal(25)
+    prior = LoadCovariance(compliance, 1e-3, 0.1 * displacements[:, [3, 90]])
+    known, found = _estimated(rows.T @ rows, rows.T @ (rows @ truth), prior)
+    seen = SeenLoads.of(known, found, prior, displacements)
+    forces = np.linalg.solve(compliance, displacements)
+    assert len(seen.values) == 12
+    scale = np.abs(rows @ forces).max()
+    np.testing.assert_allclose(seen.spots.T @ seen.spots, (rows @ forces).T @ (rows @ forces), atol=1e-6 * scale**2)
+    np.testing.assert_allclose(seen.spots.T @ seen.values, forces.T @ rows.T @ (rows @ truth), atol=1e-5 * scale**2)
+    assert SeenLoads.of(0.7 * prior.inverse, found, prior, displacements) is None or len(seen.values) == 12
+
+
+def test_the_evidence_is_that_of_a_gaussian():
+    """Against scipy's density, which knows nothing of spots."""
+    rng = np.random.default_rng(3)
+    frames = [SeenLoads(10.0 ** rng.uniform(0, 3, 9), rng.standard_normal((9, 20)), rng.normal(0, 4, 9)) for _ in "ab"]
+    cases = [(np.zeros(20), 1e-3), (np.where(np.arange(20) % 7 == 1, 2.0, 0.0), 0.02), (np.full(20, 0.3), 0.5)]
+
+    def density(variances, work):
+        covariances = [np.diag(1.0 + work * f.information) + (f.spots * variances) @ f.spots.T for f in frames]
+        return sum(multivariate_normal(cov=c).logpdf(f.values) for c, f in zip(covariances, frames, strict=True))
+
+    first = cases[0]
+    for case in cases[1:]:
+        expected = density(*case) - density(*first)
+        assert log_evidence(frames, *case) - log_evidence(frames, *first) == pytest.approx(expected, rel=1e-9)
+
+
+def _frames(loaded, displacements, force, rng):
+    """Five frames that measure all loads, those of forces (s,) on spots, to a hundredth of their usual size."""
+    root, _ = loaded.energy.loads.root(loaded.default[:1])
+    prior = LoadCovariance(root @ root, 1e-3, np.empty((25, 0)))
+    true = np.linalg.solve(prior.compliance, displacements @ force)
+    information, frames = prior.compliance / 1e-7, []
+    for _ in range(5):
+        noise = np.linalg.solve(np.linalg.cholesky(information).T, rng.standard_normal(25))
+        # A combination that is not seen, lest the prior's factor be taken for a measurement.
+        blind = information - information[:, :1] @ information[:1] / information[0, 0]
+        known, found = _estimated(blind, blind @ (true + noise), prior)
+        frames.append(SeenLoads.of(known, found, prior, displacements))
+    return frames
+
+
+def test_a_spot_that_presses_is_found_and_none_in_noise(loaded, displacements):
+    rng, force = np.random.default_rng(4), np.zeros(displacements.shape[1])
+    quiet = [spot_variances(_frames(loaded, displacements, force, rng), 1e-9) for _ in range(20)]
+    assert sum((variances > 0.0).any() for variances in quiet) <= 2
+    places = loaded.nodes[loaded.energy.loads.nodes]
+    places = np.tile(places[farthest_points(places, len(places))], (3, 1))
+    pressed = np.linalg.norm(places - [0.02, 0.035, 0.02], axis=1).argmin()
+    force[pressed] = 0.5
+    variances = spot_variances(_frames(loaded, displacements, force, rng), 1e-9)
+    centre = variances @ places / variances.sum()
+    assert np.linalg.norm(centre - places[pressed]) < 2e-3
+    assert variances.sum() == pytest.approx(0.25, rel=0.3)
+    assert (variances > 0.0).sum() <= 4
 
 
 def test_a_model_file_keeps_its_loads_and_is_checked(file, tmp_path):

@@ -1,9 +1,7 @@
-"""What is known of unknown loads before a frame is seen: their elastic energy, and that they change slowly.
+"""What is known of unknown loads before a frame is seen: their elastic energy, and that few of them act.
 
-Loads are as likely as exp(-energy / work) (`model.unknown_loads`), with a work scale for each, and from frame to frame
-they change by a part of what such loads are. The scales are stated, or found from the frames so far by maximum
-evidence: a load's is the mean square that the frames show of it, so that loads that are not there vanish (automatic
-relevance determination: MacKay, Neural Computation 4, 1992; Tipping, JMLR 1, 2001). All count as terms of the
+Loads are as likely as exp(-energy / work) (`model.unknown_loads`). Where the work scale is not stated, it is found from
+the last frames, together with compact loads that explain them better (`compact_loads`). Both count as a term of the
 estimator's cost.
 """
 
@@ -15,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.unknown_loads import ElasticEnergy
+from morph_dslam.tracking.compact_loads import LoadCovariance, SeenLoads, best_work, spot_displacements, spot_variances
 
 Array = NDArray[np.float64]
-#: Frames that work scales are found from, and the part of their mean that each keeps, lest a load could not come back.
-MEMORY, LEAST_SHARE = 5.0, 0.02
+#: Frames that the prior is found from.
+MEMORY = 5
 
 
 @dataclass(frozen=True)
@@ -27,16 +26,14 @@ class LoadOptions:
 
     Attributes
     ----------
-    work : scale of their elastic energy, J; None to find it from the sequence.
-    change : standard deviation of their change from frame to frame over their own.
+    work : scale of their elastic energy, J; None to find it, and where loads act, from the sequence.
     """
 
     work: float | None = None
-    change: float = 0.5
 
 
 class LoadPrior:
-    """The terms of the cost from unknown loads, the last m of the parameters.
+    """The term of the cost from unknown loads, the last m of the parameters.
 
     Parameters
     ----------
@@ -45,43 +42,44 @@ class LoadPrior:
 
     Attributes
     ----------
-    work : (m,) scale of the energy for each load, J.
+    covariance : of the loads.
     squared_px : variance of an image coordinate, which turns likelihoods into costs in squared pixels.
     """
 
     def __init__(self, energy: ElasticEnergy, options: LoadOptions) -> None:
-        self._loads, self._options = energy.loads, options
-        self.work, self.squared_px = np.full(energy.loads.count, energy.work), 0.25
-        self._past: tuple[Array, Array] | None = None
+        self._loads, self.squared_px = energy.loads, 0.25
+        self._displacements = None if options.work is not None else spot_displacements(energy.model, energy.loads)
+        self._frames: list[SeenLoads] = []
+        nothing = np.empty((energy.loads.count, 0))
+        self.covariance = LoadCovariance(self._compliance(energy.model.default), energy.work, nothing)
+
+    def _compliance(self, mu: Array) -> Array:
+        root, _ = self._loads.root(mu)
+        return root @ root
 
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, Hessian (n, n) and gradient (n,) by the parameters (n,), in squared pixels."""
-        m, scale = self._loads.count, 1.0 / np.sqrt(self.work)
-        root, slopes = self._loads.root(parameters[:-m])
-        scaled = scale * parameters[-m:]
-        value, rows = root @ scaled, np.hstack([(slopes @ scaled).T, root * scale])
-        cost, hessian, gradient = 0.5 * float(value @ value), rows.T @ rows, rows.T @ value
-        if self._past is not None:
-            mean, information = self._past
-            away = parameters[-m:] - mean
-            push = information @ away
-            hessian[-m:, -m:] += information
-            gradient[-m:] += push
-            cost += 0.5 * float(away @ push)
+        n, m = len(parameters), self._loads.count
+        push = self.covariance.inverse @ parameters[-m:]
+        hessian, gradient = np.zeros((n, n)), np.zeros(n)
+        hessian[-m:, -m:], gradient[-m:] = self.covariance.inverse, push
+        cost = 0.5 * float(push @ parameters[-m:])
         return self.squared_px * cost, self.squared_px * hessian, self.squared_px * gradient
 
     def learn(self, parameters: Array, covariance: Array, sigma_px: float) -> None:
         """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels."""
         m, n = self._loads.count, len(parameters)
-        q, own = parameters[-m:], covariance[n - m : n, n - m : n]
-        self.squared_px = sigma_px**2
-        if self._options.work is None:
-            found = self.work + (q**2 + np.diag(own) - self.work) / MEMORY
-            self.work = np.maximum(found, LEAST_SHARE * found.mean())
-        root, _ = self._loads.root(parameters[:-m])
-        spread = self._options.change * np.sqrt(self.work)[:, None] * np.linalg.inv(root)
-        self._past = q, np.asarray(np.linalg.inv(own + spread @ spread.T), dtype=np.float64)
+        work, spots, compliance = self.covariance.work, self.covariance.spots, self._compliance(parameters[:-m])
+        if self._displacements is not None and np.isfinite(covariance).all():
+            information = np.asarray(np.linalg.inv(covariance[n - m : n, n - m : n]), dtype=np.float64)
+            seen = SeenLoads.of(information, parameters[-m:], self.covariance, self._displacements)
+            self._frames = [*self._frames, *([] if seen is None else [seen])][-MEMORY:]
+            variances = spot_variances(self._frames, work)
+            work = best_work(self._frames, variances, work)
+            on = variances > 0.0
+            spots = self._displacements[:, on] * np.sqrt(variances[on])
+        self.covariance, self.squared_px = LoadCovariance(compliance, work, spots), sigma_px**2
 
     def forget(self) -> None:
         """The next frame may follow a gap: loads may be any."""
-        self._past = None
+        self._frames = []
