@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 ROOT = "compliance_root"
 #: Under this name reactions have what unknown loads amount to.
 LOADS = "unknown loads"
+#: A load's compliance is at least this share of the mean of all.
+LEAST_COMPLIANCE = 1e-9
 #: The search for coefficients ends at so many standard deviations.
 SPAN = 10.0
 
@@ -65,13 +67,14 @@ class UnknownLoads:
         """Number of tractions m."""
         return self.tractions.shape[2]
 
-    def root(self, mu: Array) -> tuple[Array, Array]:
-        """The root (m, m) of the compliance at parameters (d,), and its derivatives (d, m, m)."""
-        value, slopes = self.responses[ROOT].value_and_sensitivities(mu)
+    def compliance(self, mu: Array) -> Array:
+        """The compliance (m, m), J, at parameters (d,): twice the elastic energy of unit loads; positive definite."""
         rows, columns = np.triu_indices(self.count)
-        full = np.empty((1 + len(slopes), self.count, self.count))
-        full[:, rows, columns] = full[:, columns, rows] = np.concatenate([value, slopes[:, 0]])
-        return full[0], full[1:]
+        root = np.empty((self.count, self.count))
+        root[rows, columns] = root[columns, rows] = self.responses[ROOT].value(mu).ravel()
+        whole = root @ root
+        # Between the states that it is known in, polynomials may take a load's compliance to zero.
+        return whole + LEAST_COMPLIANCE * np.trace(whole) / self.count * np.eye(self.count)
 
 
 @njit(cache=True, nogil=True)

@@ -28,8 +28,9 @@ LEAST_GAIN, MOST_CHANGES = 3.0, 30
 #: The work scale may change by these factors from frame to frame, but not to less than this many times the least
 #: energy that is seen.
 WORK_FACTORS, LEAST_WORK = 2.0 ** np.arange(-3.0, 4.0), 1.0
-#: Combinations of loads of which a frame shows less than this share of what was known before do not count.
-LEAST_SEEN = 0.01
+#: Combinations of loads of which a frame shows less than this share of what was known before do not count, nor those of
+#: which it shows less than this share of what it shows of the one seen best.
+LEAST_SEEN, ROUNDING = 0.01, 1e-13
 #: What is told of a spot is at least this share of what is told of the one seen best.
 LEAST_SHARPNESS = 1e-7
 #: Steps to the variance that several frames have in common.
@@ -109,7 +110,7 @@ class SeenLoads:
         values, vectors = np.linalg.eigh(prior.root.T @ information @ prior.root)
         # What is seen least is taken to be known from the prior alone; so its factor follows.
         measured = values - values[0]
-        seen = measured > LEAST_SEEN * values[0]
+        seen = measured > max(LEAST_SEEN * values[0], ROUNDING * values[-1])
         if not seen.any():
             return None
         root, vectors = np.sqrt(measured[seen]), vectors[:, seen]

@@ -47,15 +47,9 @@ class LoadPrior:
     """
 
     def __init__(self, energy: ElasticEnergy, options: LoadOptions) -> None:
-        self._loads, self.squared_px = energy.loads, 0.25
+        self._energy, self._loads, self.squared_px = energy, energy.loads, 0.25
         self._displacements = None if options.work is not None else spot_displacements(energy.model, energy.loads)
-        self._frames: list[SeenLoads] = []
-        nothing = np.empty((energy.loads.count, 0))
-        self.covariance = LoadCovariance(self._compliance(energy.model.default), energy.work, nothing)
-
-    def _compliance(self, mu: Array) -> Array:
-        root, _ = self._loads.root(mu)
-        return root @ root
+        self.forget()
 
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, Hessian (n, n) and gradient (n,) by the parameters (n,), in squared pixels."""
@@ -69,17 +63,19 @@ class LoadPrior:
     def learn(self, parameters: Array, covariance: Array, sigma_px: float) -> None:
         """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels."""
         m, n = self._loads.count, len(parameters)
-        work, spots, compliance = self.covariance.work, self.covariance.spots, self._compliance(parameters[:-m])
+        work, spots, compliance = self.covariance.work, self.covariance.spots, self._loads.compliance(parameters[:-m])
         if self._displacements is not None and np.isfinite(covariance).all():
             information = np.asarray(np.linalg.inv(covariance[n - m : n, n - m : n]), dtype=np.float64)
             seen = SeenLoads.of(information, parameters[-m:], self.covariance, self._displacements)
             self._frames = [*self._frames, *([] if seen is None else [seen])][-MEMORY:]
-            variances = spot_variances(self._frames, work)
-            work = best_work(self._frames, variances, work)
-            on = variances > 0.0
-            spots = self._displacements[:, on] * np.sqrt(variances[on])
+            if self._frames:
+                variances = spot_variances(self._frames, work)
+                work = best_work(self._frames, variances, work)
+                spots = self._displacements[:, variances > 0.0] * np.sqrt(variances[variances > 0.0])
         self.covariance, self.squared_px = LoadCovariance(compliance, work, spots), sigma_px**2
 
     def forget(self) -> None:
-        """The next frame may follow a gap: loads may be any."""
-        self._frames = []
+        """The next frame is the first, or may follow a gap: loads may be any."""
+        compliance = self._loads.compliance(self._energy.model.default)
+        self._frames: list[SeenLoads] = []
+        self.covariance = LoadCovariance(compliance, self._energy.work, np.empty((self._loads.count, 0)))
