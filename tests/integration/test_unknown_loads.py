@@ -187,10 +187,8 @@ def test_spots_do_the_work_that_loads_do_on_what_they_cause(loaded, displacement
     """Reciprocity: finite elements solved with the pressure of a spot, whose displacement each load works on."""
     loads, model, problem = loaded.energy.loads, loaded.energy.model, make_study(STUDY).problem()
     assert displacements.shape == (25, 3 * len(loads.nodes))
-    surface, tangent = (
-        problem.loaded_surface("z_max", inward=True),
-        problem.linearise(problem.initial_state().dofs, [0]),
-    )
+    surface = problem.loaded_surface("z_max", inward=True)
+    tangent = problem.linearise(problem.initial_state().dofs, np.zeros(1))
     positions = model.nodes[loads.nodes]
     places = positions[farthest_points(positions, len(positions))]
     spot = np.linalg.norm(places[:, :2] - 0.03, axis=1).argmin()
@@ -224,7 +222,7 @@ def test_what_a_frame_shows_is_separated_from_the_prior(loaded, displacements):
     scale = np.abs(rows @ forces).max()
     np.testing.assert_allclose(seen.spots.T @ seen.spots, (rows @ forces).T @ (rows @ forces), atol=1e-6 * scale**2)
     np.testing.assert_allclose(seen.spots.T @ seen.values, forces.T @ rows.T @ (rows @ truth), atol=1e-5 * scale**2)
-    assert SeenLoads.of(0.7 * prior.inverse, found, prior, displacements) is None or len(seen.values) == 12
+    assert SeenLoads.of(0.7 * prior.inverse, found, prior, displacements) is None
 
 
 def test_the_evidence_is_that_of_a_gaussian():

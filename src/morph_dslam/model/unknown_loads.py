@@ -7,7 +7,6 @@ loads is q' C(mu) q / 2 with the compliance C, and tells what loads are likely: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
@@ -222,24 +221,18 @@ def _of_tractions(model: ReducedModel, loads: UnknownLoads) -> dict[str, Separat
     }
 
 
+def triangles_between(model: ReducedModel, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The surface's triangles (t, 3) all of whose corners are among ``nodes`` (k,)."""
+    return model.triangles[np.isin(model.triangles, nodes).all(axis=1)]
+
+
 def node_areas(model: ReducedModel, nodes: NDArray[np.int64]) -> Array:
     """Area (k,) of the undeformed surface, m2, that belongs to each of ``nodes`` (k,)."""
-    return _gathered(model, nodes, lambda crosses: np.linalg.norm(crosses, axis=1, keepdims=True) / 6.0)[:, 0]
-
-
-def node_normals(model: ReducedModel, nodes: NDArray[np.int64]) -> Array:
-    """Unit normals (k, 3) of the undeformed surface at each of ``nodes`` (k,), means over their triangles."""
-    sums = _gathered(model, nodes, lambda crosses: crosses)
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
-
-
-def _gathered(model: ReducedModel, nodes: NDArray[np.int64], of: Callable[[Array], Array]) -> Array:
-    """Sums (k, c) at ``nodes`` (k,) of what their triangles have, (t, c) ``of`` the products (t, 3) of two edges."""
-    inside = np.isin(model.triangles, nodes).all(axis=1)
-    a, b, c = np.moveaxis(model.nodes[model.triangles[inside]], 1, 0)
-    values, corners = of(np.cross(b - a, c - a)), model.triangles[inside].ravel()
-    sums = [np.bincount(corners, np.repeat(column, 3), len(model.nodes)) for column in values.T]
-    return np.asarray(np.column_stack(sums)[nodes], dtype=np.float64)
+    triangles = triangles_between(model, nodes)
+    a, b, c = np.moveaxis(model.nodes[triangles], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
+    totals = np.bincount(triangles.ravel(), np.repeat(areas, 3), len(model.nodes))
+    return np.asarray(totals[nodes], dtype=np.float64)
 
 
 def _constant(model: ReducedModel) -> ParameterFunctions:

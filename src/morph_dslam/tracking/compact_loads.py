@@ -18,7 +18,8 @@ from scipy.spatial import KDTree
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import farthest_points
-from morph_dslam.model.unknown_loads import UnknownLoads, node_areas, node_normals
+from morph_dslam.model.unknown_loads import UnknownLoads, node_areas, triangles_between
+from morph_dslam.render.shading import vertex_normals
 
 Array = NDArray[np.float64]
 #: Places for each load and at most; sizes of the spots there (standard deviations) over the places' distance.
@@ -31,7 +32,7 @@ WORK_FACTORS, LEAST_WORK = 2.0 ** np.arange(-3.0, 4.0), 1.0
 #: Combinations of loads of which a frame shows less than this share of what was known before do not count, nor those of
 #: which it shows less than this share of what it shows of the one seen best.
 LEAST_SEEN, ROUNDING = 0.01, 1e-13
-#: What is told of a spot is at least this share of what is told of the one seen best.
+#: The information on a spot is at least this share of that on the one seen best.
 LEAST_SHARPNESS = 1e-7
 #: Steps to the variance that several frames have in common.
 STEPS = 3
@@ -49,8 +50,10 @@ def spot_displacements(model: ReducedModel, loads: UnknownLoads) -> Array:
     gap = float(np.median(KDTree(places).query(places, k=2)[0][:, 1]))
     spots = np.hstack([np.exp(-0.5 * (distance / (size * gap)) ** 2) for size in SIZES])
     spots *= node_areas(model, nodes)[:, None]
-    responses = loads.responses["displacement"].value(model.default)[nodes].reshape(len(nodes), loads.count, 3)
-    along = np.einsum("nmc,nc->mn", responses, node_normals(model, nodes))
+    responses = loads.responses["displacement"]
+    of_nodes = responses.with_modes(responses.modes[:, nodes]).value(model.default).reshape(len(nodes), loads.count, 3)
+    normals = vertex_normals(model.nodes, triangles_between(model, nodes))[nodes]
+    along = np.einsum("nmc,nc->mn", of_nodes, normals)
     return np.asarray(along @ (spots / spots.sum(axis=0)), dtype=np.float64)
 
 
@@ -70,16 +73,15 @@ class LoadCovariance:
     spots: Array
 
     @cached_property
-    def root(self) -> Array:
-        """R (m, m) with the covariance R R'."""
+    def whitening(self) -> Array:
+        """W (m, m), which makes loads independent and of unit variance: the covariance's inverse is W' W."""
         factor = np.linalg.cholesky(self.work * self.compliance + self.spots @ self.spots.T)
-        return np.asarray(np.linalg.solve(self.compliance, factor), dtype=np.float64)
+        return np.asarray(np.linalg.solve(factor, self.compliance), dtype=np.float64)
 
     @cached_property
     def inverse(self) -> Array:
         """(m, m)."""
-        rows = np.linalg.inv(self.root)
-        return rows.T @ rows
+        return self.whitening.T @ self.whitening
 
 
 @dataclass(frozen=True)
@@ -107,15 +109,15 @@ class SeenLoads:
         loads : (m,) as estimated.
         displacements : (m, s) of s spots; see `spot_displacements`.
         """
-        values, vectors = np.linalg.eigh(prior.root.T @ information @ prior.root)
+        root = np.linalg.inv(prior.whitening)
+        values, vectors = np.linalg.eigh(root.T @ information @ root)
         # What is seen least is taken to be known from the prior alone; so its factor follows.
         measured = values - values[0]
         seen = measured > max(LEAST_SEEN * values[0], ROUNDING * values[-1])
         if not seen.any():
             return None
-        root, vectors = np.sqrt(measured[seen]), vectors[:, seen]
-        rows = root[:, None] * np.linalg.solve(prior.root.T, vectors).T
-        values_seen = values[seen] / root * (vectors.T @ np.linalg.solve(prior.root, loads))
+        scale, combinations = np.sqrt(measured[seen]), vectors[:, seen].T @ prior.whitening
+        rows, values_seen = scale[:, None] * combinations, values[seen] / scale * (combinations @ loads)
         by_compliance = np.linalg.solve(prior.compliance, rows.T)
         energies, turn = np.linalg.eigh(rows @ by_compliance)
         return cls(energies, turn.T @ (by_compliance.T @ displacements), turn.T @ values_seen)
@@ -165,7 +167,7 @@ def spot_variances(frames: list[SeenLoads], work: float) -> Array:
 
 def _best_variances(evidences: list[_Evidence], variances: Array) -> tuple[Array, Array]:
     """The variance (s,) of each spot that is best while those of the others stay, and what its evidence gains (s,)."""
-    sharpness, pull = (np.array([getattr(one, name) for one in evidences]) for name in ("sharpness", "pull"))
+    sharpness, pull = np.array([one.sharpness for one in evidences]), np.array([one.pull for one in evidences])
     # As if the spot were left out.
     rest = np.maximum(1.0 - variances * sharpness, 1e-6)
     sharpness, pull = sharpness / rest, pull / rest

@@ -8,6 +8,7 @@ estimator's cost.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,13 @@ class LoadPrior:
 
     def __init__(self, energy: ElasticEnergy, options: LoadOptions) -> None:
         self._energy, self._loads, self.squared_px = energy, energy.loads, 0.25
-        self._displacements = None if options.work is not None else spot_displacements(energy.model, energy.loads)
+        self._is_stated = options.work is not None
         self.forget()
+
+    @cached_property
+    def _displacements(self) -> Array:
+        """Of the spots (m, s); only the prior that learns needs them."""
+        return spot_displacements(self._energy.model, self._loads)
 
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, Hessian (n, n) and gradient (n,) by the parameters (n,), in squared pixels."""
@@ -64,7 +70,7 @@ class LoadPrior:
         """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels."""
         m, n = self._loads.count, len(parameters)
         work, spots, compliance = self.covariance.work, self.covariance.spots, self._loads.compliance(parameters[:-m])
-        if self._displacements is not None and np.isfinite(covariance).all():
+        if not self._is_stated and np.isfinite(covariance).all():
             information = np.asarray(np.linalg.inv(covariance[n - m : n, n - m : n]), dtype=np.float64)
             seen = SeenLoads.of(information, parameters[-m:], self.covariance, self._displacements)
             self._frames = [*self._frames, *([] if seen is None else [seen])][-MEMORY:]
