@@ -59,7 +59,7 @@ def spot_displacements(model: ReducedModel, loads: UnknownLoads) -> Array:
 
 @dataclass(frozen=True)
 class LoadCovariance:
-    """The covariance of m loads: C^-1 (w C + D V D') C^-1.
+    """The covariance of m loads, whatever acted before: C^-1 (w C + D V D') C^-1.
 
     Attributes
     ----------
@@ -72,15 +72,40 @@ class LoadCovariance:
     work: float
     spots: Array
 
+    @property
+    def value(self) -> Array:
+        """(m, m)."""
+        factor = np.linalg.cholesky(self.work * self.compliance + self.spots @ self.spots.T)
+        root = np.linalg.solve(self.compliance, factor)
+        return np.asarray(root @ root.T, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class LoadPrediction:
+    """What is known of m loads before a frame is seen.
+
+    Attributes
+    ----------
+    mean : (m,).
+    covariance : (m, m).
+    """
+
+    mean: Array
+    covariance: Array
+
+    @cached_property
+    def root(self) -> Array:
+        """Lower triangle L (m, m): the covariance is L L'."""
+        return np.asarray(np.linalg.cholesky(self.covariance), dtype=np.float64)
+
     @cached_property
     def whitening(self) -> Array:
-        """W (m, m), which makes loads independent and of unit variance: the covariance's inverse is W' W."""
-        factor = np.linalg.cholesky(self.work * self.compliance + self.spots @ self.spots.T)
-        return np.asarray(np.linalg.solve(factor, self.compliance), dtype=np.float64)
+        """L^-1 (m, m), which makes loads independent and of unit variance."""
+        return np.asarray(np.linalg.inv(self.root), dtype=np.float64)
 
     @cached_property
     def inverse(self) -> Array:
-        """(m, m)."""
+        """Of the covariance, (m, m)."""
         return self.whitening.T @ self.whitening
 
 
@@ -100,25 +125,29 @@ class SeenLoads:
     values: Array
 
     @classmethod
-    def of(cls, information: Array, loads: Array, prior: LoadCovariance, displacements: Array) -> SeenLoads | None:
-        """From what is known of loads that were estimated with a prior; None if that is the prior alone.
+    def of(
+        cls, information: Array, loads: Array, known: LoadPrediction, compliance: Array, displacements: Array
+    ) -> SeenLoads | None:
+        """From loads that were estimated with a prior; None if that is the prior alone.
 
         Parameters
         ----------
         information : (m, m), inverse of their covariance, which has the prior's times a factor in it.
         loads : (m,) as estimated.
+        known : the prior.
+        compliance : (m, m), J.
         displacements : (m, s) of s spots; see `spot_displacements`.
         """
-        root = np.linalg.inv(prior.whitening)
-        values, vectors = np.linalg.eigh(root.T @ information @ root)
+        values, vectors = np.linalg.eigh(known.root.T @ information @ known.root)
         # What is seen least is taken to be known from the prior alone; so its factor follows.
         measured = values - values[0]
         seen = measured > max(LEAST_SEEN * values[0], ROUNDING * values[-1])
         if not seen.any():
             return None
-        scale, combinations = np.sqrt(measured[seen]), vectors[:, seen].T @ prior.whitening
-        rows, values_seen = scale[:, None] * combinations, values[seen] / scale * (combinations @ loads)
-        by_compliance = np.linalg.solve(prior.compliance, rows.T)
+        scale, combinations = np.sqrt(measured[seen]), vectors[:, seen].T @ known.whitening
+        rows = scale[:, None] * combinations
+        values_seen = (values[seen] * (combinations @ loads) - values[0] * (combinations @ known.mean)) / scale
+        by_compliance = np.linalg.solve(compliance, rows.T)
         energies, turn = np.linalg.eigh(rows @ by_compliance)
         return cls(energies, turn.T @ (by_compliance.T @ displacements), turn.T @ values_seen)
 

@@ -1,24 +1,34 @@
-"""What is known of unknown loads before a frame is seen: their elastic energy, and that few of them act.
+"""What is known of unknown loads before a frame: their elastic energy, that few act, and that they change slowly.
 
-Loads are as likely as exp(-energy / work) (`model.unknown_loads`). Where the work scale is not stated, it is found from
-the last frames, together with compact loads that explain them better (`compact_loads`). Both count as a term of the
-estimator's cost.
+Loads are as likely as exp(-energy / work) (`model.unknown_loads`). Where the work scale is not stated, it is found
+from the last frames, together with compact loads that explain them better (`compact_loads`). What a frame found then
+counts for the next one, too: loads are a stationary process of first order, q' = a q + sqrt(1 - a^2) w, with w of the
+covariance that was found. All that is a term of the estimator's cost.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.unknown_loads import ElasticEnergy
-from morph_dslam.tracking.compact_loads import LoadCovariance, SeenLoads, best_work, spot_displacements, spot_variances
+from morph_dslam.tracking.compact_loads import (
+    LoadCovariance,
+    LoadPrediction,
+    SeenLoads,
+    best_work,
+    spot_displacements,
+    spot_variances,
+)
 
 Array = NDArray[np.float64]
 #: Frames that the prior is found from.
 MEMORY = 5
+#: The share of loads that a frame has in common with the one before.
+KEPT = 0.8
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,7 @@ class LoadPrior:
 
     Attributes
     ----------
-    covariance : of the loads.
+    known : of the loads before the next frame.
     squared_px : variance of an image coordinate, which turns likelihoods into costs in squared pixels.
     """
 
@@ -60,28 +70,45 @@ class LoadPrior:
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, Hessian (n, n) and gradient (n,) by the parameters (n,), in squared pixels."""
         n, m = len(parameters), self._loads.count
-        push = self.covariance.inverse @ parameters[-m:]
+        away = parameters[-m:] - self.known.mean
+        push = self.known.inverse @ away
         hessian, gradient = np.zeros((n, n)), np.zeros(n)
-        hessian[-m:, -m:], gradient[-m:] = self.covariance.inverse, push
-        cost = 0.5 * float(push @ parameters[-m:])
+        hessian[-m:, -m:], gradient[-m:] = self.known.inverse, push
+        cost = 0.5 * float(push @ away)
         return self.squared_px * cost, self.squared_px * hessian, self.squared_px * gradient
 
     def learn(self, parameters: Array, covariance: Array, sigma_px: float) -> None:
         """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels."""
         m, n = self._loads.count, len(parameters)
-        work, spots, compliance = self.covariance.work, self.covariance.spots, self._loads.compliance(parameters[:-m])
-        if not self._is_stated and np.isfinite(covariance).all():
-            information = np.asarray(np.linalg.inv(covariance[n - m : n, n - m : n]), dtype=np.float64)
-            seen = SeenLoads.of(information, parameters[-m:], self.covariance, self._displacements)
-            self._frames = [*self._frames, *([] if seen is None else [seen])][-MEMORY:]
-            if self._frames:
-                variances = spot_variances(self._frames, work)
-                work = best_work(self._frames, variances, work)
-                spots = self._displacements[:, variances > 0.0] * np.sqrt(variances[variances > 0.0])
-        self.covariance, self.squared_px = LoadCovariance(compliance, work, spots), sigma_px**2
+        loads, own = parameters[-m:], covariance[n - m : n, n - m : n]
+        is_determined, is_settled = bool(np.isfinite(covariance).all()), len(self._frames) == MEMORY
+        self._covariance = replace(self._covariance, compliance=self._loads.compliance(parameters[:-m]))
+        if is_determined and not self._is_stated:
+            self._find_scales(np.asarray(np.linalg.inv(own), dtype=np.float64), loads)
+        self.squared_px = sigma_px**2
+        # The first work scale is a guess, and so is what frames show of loads that they hardly see until it is found.
+        kept = KEPT if is_determined and is_settled else 0.0
+        new = (1.0 - kept**2) * self._covariance.value
+        self.known = LoadPrediction(kept * loads, kept**2 * own + new if kept else new)
+
+    def _find_scales(self, information: Array, loads: Array) -> None:
+        """Find work scale and variances of spots that explain the last frames best.
+
+        ``information`` (m, m) is the inverse of the covariance of this frame's ``loads`` (m,).
+        """
+        compliance, work = self._covariance.compliance, self._covariance.work
+        seen = SeenLoads.of(information, loads, self.known, compliance, self._displacements)
+        self._frames = [*self._frames, *([] if seen is None else [seen])][-MEMORY:]
+        if not self._frames:
+            return
+        variances = spot_variances(self._frames, work)
+        work = best_work(self._frames, variances, work)
+        spots = self._displacements[:, variances > 0.0] * np.sqrt(variances[variances > 0.0])
+        self._covariance = LoadCovariance(compliance, work, spots)
 
     def forget(self) -> None:
         """The next frame is the first, or may follow a gap: loads may be any."""
-        compliance = self._loads.compliance(self._energy.model.default)
+        m, compliance = self._loads.count, self._loads.compliance(self._energy.model.default)
         self._frames: list[SeenLoads] = []
-        self.covariance = LoadCovariance(compliance, self._energy.work, np.empty((self._loads.count, 0)))
+        self._covariance = LoadCovariance(compliance, self._energy.work, np.empty((m, 0)))
+        self.known = LoadPrediction(np.zeros(m), self._covariance.value)
