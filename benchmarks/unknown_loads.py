@@ -186,7 +186,7 @@ def _normalised(model: md.ReducedModel, estimate: Estimate, surface: np.ndarray,
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=3, help="at how many places (%(default)s)")
-    parser.add_argument("--modes", type=int, default=120, help="unknown loads (%(default)s)")
+    parser.add_argument("--modes", type=int, default=240, help="unknown loads (%(default)s)")
     parser.add_argument("--time", action="store_true", help="only the time of an estimate with 30 loads")
     parser.add_argument("--keep", type=Path, help="folder to keep the model in")
     arguments = parser.parse_args()

@@ -14,6 +14,7 @@ from morph_dslam.tracking.estimator import (
     State,
     linearise,
     moved,
+    products_of_rows,
     project_with_jacobian,
 )
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
@@ -53,6 +54,12 @@ def observed(points, state, noise, rng):
 def start_near(rng, scale=1.0):
     step = scale * np.concatenate([[0.01, -0.2, 0.08], 0.1 * rng.standard_normal(3), [0.02, -0.01, 0.03]])
     return moved(TRUTH, step)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 13])
+def test_products_of_rows_are_those_of_the_matrix(count):
+    rows = np.random.default_rng(count).standard_normal((count, 7))
+    np.testing.assert_allclose(products_of_rows(rows), rows @ rows.T, rtol=0.0, atol=1e-13)
 
 
 def test_jacobian_agrees_with_finite_differences(points):

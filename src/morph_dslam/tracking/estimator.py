@@ -119,21 +119,39 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
             slopes[1, 1, j], slopes[1, 2, j] = ay, -ay * y
             rows[size, j], rows[size, n_points + j] = root * residuals[j, 0], root * residuals[j, 1]
     _fill_derivatives(rows, fields, slopes, turned, rotation)
-    hessian, gradient = np.empty((size, size)), np.empty(size)
-    for a in range(size):
-        gradient[a] = sum_of_products(rows[a], rows[size])
-        for b in range(a + 1):
-            hessian[a, b] = hessian[b, a] = sum_of_products(rows[a], rows[b])
-    return cost, hessian, gradient, residuals
+    products = products_of_rows(rows)
+    return cost, np.ascontiguousarray(products[:size, :size]), products[:size, size].copy(), residuals
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def sum_of_products(a, b):
-    """Sum of the products of two rows of numbers, in any order."""
-    total = 0.0
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
+def products_of_rows(rows):
+    """``rows`` (n, m) times their transpose, (n, n), with the products added up in any order.
+
+    Three rows times two at a pass: a number that is read then counts for several products.
+    """
+    n, m = rows.shape
+    result = np.empty((n, n))
+    for a in range(0, n, 3):
+        # Rows that are not there are taken to be the last one, whose products are then written again.
+        a1, a2 = min(a + 1, n - 1), min(a + 2, n - 1)
+        p, q, r = rows[a], rows[a1], rows[a2]
+        for b in range(0, a2 + 1, 2):
+            b1 = min(b + 1, n - 1)
+            s, t = rows[b], rows[b1]
+            ps, pt, qs, qt, rs, rt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(m):
+                ps += p[k] * s[k]
+                pt += p[k] * t[k]
+                qs += q[k] * s[k]
+                qt += q[k] * t[k]
+                rs += r[k] * s[k]
+                rt += r[k] * t[k]
+            result[a, b], result[a, b1], result[a1, b], result[a1, b1] = ps, pt, qs, qt
+            result[a2, b], result[a2, b1] = rs, rt
+    for a in range(n):
+        for b in range(a):
+            result[b, a] = result[a, b]
+    return result
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -344,12 +362,6 @@ class EstimationOptions:
     loads: LoadOptions = field(default_factory=LoadOptions)
 
 
-def padded(terms: tuple[float, Array, Array]) -> tuple[float, Array, Array]:
-    """Terms of a cost that does not depend on the pose, with zeros for it."""
-    cost, hessian, gradient = terms
-    return cost, np.pad(hessian, (0, 6)), np.pad(gradient, (0, 6))
-
-
 @dataclass(frozen=True)
 class Estimate:
     """The minimum that was found.
@@ -397,6 +409,12 @@ class Estimator:
         self.loads = None if model.energy is None else LoadPrior(model.energy, self.options.loads)
 
     @property
+    def _place_of_loads(self) -> slice:
+        """Of the coefficients of unknown loads among the unknowns."""
+        d = len(self.model.parameters)
+        return slice(d - self.model.n_loads, d)
+
+    @property
     def scale(self) -> Array:
         """Of the unknowns (d + 6,): half a parameter range, one radian, the object's size."""
         return self.box.scale
@@ -431,12 +449,15 @@ class Estimator:
             points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
         )  # fmt: skip
         others = [] if prior is None else [prior.terms(state)]
-        if self.loads is not None:
-            others.append(padded(self.loads.terms(state.parameters)))
         if depths is not None:
             others.append(depths.terms(points, state)[:3])
         for terms in others:
             cost, hessian, gradient = cost + terms[0], hessian + terms[1], gradient + terms[2]
+        if self.loads is not None:
+            of_loads, information, push = self.loads.terms(state.parameters)
+            cost, place = cost + of_loads, self._place_of_loads
+            hessian[place, place] += information
+            gradient[place] += push
         return cost, hessian, gradient, residuals
 
     def estimate(
@@ -497,9 +518,11 @@ class Estimator:
         linear = LinearCost.about(measured, estimate.state, estimate.residuals, self.camera, huber, self.scale)
         if self.loads is None:
             return linear
-        information = padded(self.loads.terms(estimate.state.parameters))[1]
-        of_priors = linear.of_depths + self.loads.squared_px * information
-        return replace(linear, hessian=linear.hessian + information, of_depths=of_priors)
+        hessian, of_priors, place = linear.hessian.copy(), linear.of_depths.copy(), self._place_of_loads
+        information = self.loads.terms(estimate.state.parameters)[1]
+        hessian[place, place] += information
+        of_priors[place, place] += self.loads.squared_px * information
+        return replace(linear, hessian=hessian, of_depths=of_priors)
 
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]

@@ -68,14 +68,11 @@ class LoadPrior:
         return spot_displacements(self._energy.model, self._loads)
 
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Cost, Hessian (n, n) and gradient (n,) by the parameters (n,), in squared pixels."""
-        n, m = len(parameters), self._loads.count
-        away = parameters[-m:] - self.known.mean
+        """Cost, and its Hessian (m, m) and gradient (m,) by the loads, at parameters (n,); in squared pixels."""
+        away = parameters[-self._loads.count :] - self.known.mean
         push = self.known.inverse @ away
-        hessian, gradient = np.zeros((n, n)), np.zeros(n)
-        hessian[-m:, -m:], gradient[-m:] = self.known.inverse, push
         cost = 0.5 * float(push @ away)
-        return self.squared_px * cost, self.squared_px * hessian, self.squared_px * gradient
+        return self.squared_px * cost, self.squared_px * self.known.inverse, self.squared_px * push
 
     def learn(self, parameters: Array, covariance: Array, sigma_px: float) -> None:
         """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels."""
