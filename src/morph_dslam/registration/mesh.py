@@ -72,8 +72,9 @@ AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
 #: does not put there (`AGAINST`, where the images on its surface show its shape), or no less than the keyframes
 #: leave open by so many standard deviations of that share (one-sided, 5 %); where landmarks have it, by the outline
-#: alone. Its images are believed before its edges unless they lose more than this part of the score.
-CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST = 10.0, 0.5, 1.645, 5.0
+#: alone. Its images are believed before its edges unless they lose more than this part of the score. Below the last
+#: score, edges that no images confirm are not enough: the points of the map are searched as well.
+CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST, SURE = 10.0, 0.5, 1.645, 5.0, 20.0
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -197,25 +198,26 @@ def register_mesh(
                 RegistrationFailure.NOT_FOUND,
             )
         return _by_edges(places, search, points, views, metric, bool(hints.clicks))
-    if _clear([place.rank for place in places]):
-        return _by_edges(places, search, points, views, metric)
-    by_edges = bool(places) and 100.0 * places[0].rank >= CONFIRMED
+    score = 100.0 * places[0].rank if places else 0.0
+    by_edges = _by_edges(places, search, points, views, metric) if score >= CONFIRMED else None
+    if by_edges and _clear([place.rank for place in places]) and (score >= SURE or by_edges.keyframes is not None):
+        return by_edges
     try:
         found = _by_points(search, points, views, metric, progress)
     except RegistrationError:
-        if not by_edges:
+        if by_edges is None:
             raise
-        return _by_edges(places, search, points, views, metric)
+        return by_edges
     there = search.at(found.world_from_object)
     if by_edges and there.rank < AMBIGUOUS * places[0].rank:
-        return _by_edges(places, search, points, views, metric)
+        return by_edges
     informative = 0.0 < there.edges.chance < TELLING_CHANCE
     return replace(found, edges=there.edges) if informative and there.edges.gain < AGAINST else found
 
 
 def _clear(ranks: list[float]) -> bool:
-    """Whether the first of the places, the best first, is one and the next one is much worse."""
-    return 100.0 * ranks[0] >= CONFIRMED and max([0.0, *ranks[1:]]) <= AMBIGUOUS * ranks[0] if ranks else False
+    """Whether the first of the places, the best first, is much better than the next one."""
+    return max([0.0, *ranks[1:]]) <= AMBIGUOUS * ranks[0]
 
 
 def _by_edges(
