@@ -72,9 +72,10 @@ AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
 #: does not put there (`AGAINST`, where the images on its surface show its shape), or no less than the keyframes
 #: leave open by so many standard deviations of that share (one-sided, 5 %); where landmarks have it, by the outline
-#: alone. Its images are believed before its edges unless they lose more than this part of the score. Below the last
-#: score, edges that no images confirm are not enough: the points of the map are searched as well.
-CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST, SURE = 10.0, 0.5, 1.645, 5.0, 20.0
+#: alone. Its images are believed before its edges unless they lose more than this part of the score, and always where
+#: the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise. Below the last score,
+#: edges that no images confirm are not enough: the points of the map are searched as well.
+CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST, EXACT_PX, SURE = 10.0, 0.5, 1.645, 5.0, 0.05, 20.0
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -254,8 +255,8 @@ def _by_edges(
         nodes.mean(axis=0),
         metric,
     )
-    there = search.at(adjusted.world_from_object)
-    if adjusted.keyframes is None or 100.0 * there.rank < score - LOST:
+    there, keyframes = search.at(adjusted.world_from_object), adjusted.keyframes
+    if keyframes is None or (100.0 * there.rank < score - LOST and keyframes.rms_px > EXACT_PX):
         return found
     outline = outline_fit(adjusted.world_from_object, nodes, triangles, asked, search.camera)
     return replace(adjusted, edges=there.edges, outline=outline)
