@@ -5,7 +5,7 @@ that the model does not know; its one parameter, shear on top, is another load. 
 and law (Yeoh rubber of the same modulus, contact). 500 points of the top are seen from 0.4 m at 40 degrees by a 640x480
 camera, with 0.3 px of noise; the pose is known to 0.1 mrad and 0.05 mm, as in a map. What the ball hides is not seen;
 or it is ("through", as of a tool that is as thin as its contact); or 40 % of the surface are hidden besides. Figures
-are means over the frames from 3 mm on. The constants of the method were chosen at a place that is not among these.
+are means over the frames from 3 mm on. How many loads, and the method's constants, were chosen at two other places.
 Run: python benchmarks/unknown_loads.py
 """
 
