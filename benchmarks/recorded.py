@@ -305,8 +305,8 @@ BENCHMARKS = {
         "finite elements with another mesh and law, with contact",
         "0.3 px on points, 0.1 mrad and 0.05 mm on the pose",
         7,
-        "The figures without prefix are those where the ball hides what is behind it. How many loads, and the constants "
-        "of what is known of them beforehand, were chosen at two other places, with the errors there in sight.",
+        "The figures without prefix are those where the ball hides what is behind it. How many loads, and the "
+        "constants of what is known beforehand, were chosen at two other places, with the errors there in sight.",
     ),
     "discretisation": Benchmark(
         "Mechanics",
