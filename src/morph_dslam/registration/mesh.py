@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -72,10 +73,13 @@ AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
 #: does not put there (`AGAINST`, where the images on its surface show its shape), or no less than the keyframes
 #: leave open by so many standard deviations of that share (one-sided, 5 %); where landmarks have it, by the outline
-#: alone. Its images are believed before its edges unless they lose more than this part of the score, and always where
-#: the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise. Below the last score,
-#: edges that no images confirm are not enough: the points of the map are searched as well.
-CONFIRMED, OUTLINE_SHOWN, ONE_SIDED, LOST, EXACT_PX, SURE = 10.0, 0.5, 1.645, 5.0, 0.05, 20.0
+#: alone.
+CONFIRMED, OUTLINE_SHOWN, ONE_SIDED = 10.0, 0.5, 1.645
+#: Below this score edges that no images confirm are not enough: the points of the map are searched as well.
+SURE = 20.0
+#: Images on the object are believed before its edges unless they lose more than this part of the score; and always
+#: where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise.
+LOST, EXACT_PX = 5.0, 0.05
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -200,18 +204,19 @@ def register_mesh(
             )
         return _by_edges(places, search, points, views, metric, bool(hints.clicks))
     score = 100.0 * places[0].rank if places else 0.0
-    by_edges = _by_edges(places, search, points, views, metric) if score >= CONFIRMED else None
-    if by_edges and _clear([place.rank for place in places]) and (score >= SURE or by_edges.keyframes is not None):
-        return by_edges
+    by_edges = cache(partial(_by_edges, places, search, points, views, metric))
+    is_clear = score >= CONFIRMED and _clear([place.rank for place in places])
+    if is_clear and (score >= SURE or by_edges().keyframes is not None):
+        return by_edges()
     try:
         found = _by_points(search, points, views, metric, progress)
     except RegistrationError:
-        if by_edges is None:
+        if score < CONFIRMED:
             raise
-        return by_edges
+        return by_edges()
     there = search.at(found.world_from_object)
-    if by_edges and there.rank < AMBIGUOUS * places[0].rank:
-        return by_edges
+    if score >= CONFIRMED and there.rank < AMBIGUOUS * places[0].rank:
+        return by_edges()
     informative = 0.0 < there.edges.chance < TELLING_CHANCE
     return replace(found, edges=there.edges) if informative and there.edges.gain < AGAINST else found
 

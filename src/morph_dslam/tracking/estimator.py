@@ -226,9 +226,9 @@ def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsi
     residuals : (p, 2) of the estimate, pixels.
     """
     _, jacobian = project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics)
-    size = jacobian.shape[2]
-    hessian = np.zeros((size, size))
-    for j in range(len(rest)):
+    n_points, size = len(rest), jacobian.shape[2]
+    rows = np.zeros((size, 2 * n_points))
+    for j in range(n_points):
         across, down = jacobian[j, 0], jacobian[j, 1]
         length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
         if not (weights[j] > 0.0 and np.isfinite(length)):
@@ -239,13 +239,12 @@ def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsi
             for a in range(size):
                 slope = n0 * across[a] + n1 * down[a]
                 across[a], down[a] = n0 * slope, n1 * slope
-        factor, root = min(1.0, huber / max(length, 1e-300)), np.sqrt(weights[j])
+        factor = min(1.0, huber / max(length, 1e-300))
+        root, scale = np.sqrt(factor * weights[j]), factor * np.sqrt(weights[j])
         for a in range(size):
-            first, second, row = factor * weights[j] * across[a], factor * weights[j] * down[a], hessian[a]
-            for b in range(size):
-                row[b] += first * across[b] + second * down[b]
-        for a in range(size):
-            across[a], down[a] = factor * root * across[a], factor * root * down[a]
+            rows[a, j], rows[a, n_points + j] = root * across[a], root * down[a]
+            across[a], down[a] = scale * across[a], scale * down[a]
+    hessian = products_of_rows(rows)
     return jacobian, hessian
 
 

@@ -83,7 +83,7 @@ class LoadPrior:
         if is_determined and not self._is_stated:
             self._find_scales(np.asarray(np.linalg.inv(own), dtype=np.float64), loads)
         self.squared_px = sigma_px**2
-        # The first work scale is a guess, and so is what frames show of loads that they hardly see until it is found.
+        # The first work scale is a guess. Until a better one is found, so are loads that the frames hardly see.
         kept = KEPT if is_determined and is_settled else 0.0
         new = (1.0 - kept**2) * self._covariance.value
         self.known = LoadPrediction(kept * loads, kept**2 * own + new if kept else new)
