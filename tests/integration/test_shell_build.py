@@ -43,7 +43,7 @@ turn = 4.0
 
 [[pose]]
 frame = 0
-position_mm = [0, 0, 220]
+position_mm = [0, 0, 130]
 rotation_deg = [-90, 0, 0]
 """
 
