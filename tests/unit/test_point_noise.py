@@ -76,6 +76,19 @@ def test_residuals_of_nothing_do_not_make_an_estimate_exact():
     np.testing.assert_allclose(covariance, np.diag([1.0 / 50.0, 1.0 / np.sum(x**2)]) * 1e-4, rtol=1e-9, atol=1e-18)
 
 
+@pytest.mark.parametrize("unseen", [[], [4], [0, 7]])
+def test_what_points_do_not_see_leaves_the_covariance_of_all_else(unseen):
+    """Ten unknowns of sizes a thousand apart: NumPy's inverse of those that are seen, and next to nothing of the rest."""
+    rng = np.random.default_rng(7)
+    jacobian, seen = rng.standard_normal((400, 10)) * np.logspace(-1.5, 1.5, 10), np.ones(10, dtype=bool)
+    jacobian[:, unseen], seen[unseen] = 0.0, False
+    residuals, hessian = rng.standard_normal((200, 2)), jacobian.T @ jacobian
+    _, covariance = huber_covariance(hessian, residuals, np.ones(200), np.full(200, 2), 1e3, np.ones(10))
+    variance, among = np.sum(residuals**2) / (400 - 10), np.ix_(seen, seen)
+    np.testing.assert_allclose(covariance[among], variance * np.linalg.inv(hessian[among]), rtol=1e-9, atol=1e-15)
+    assert (np.diag(covariance)[~seen] > 1e5 * np.diag(covariance)[seen].max()).all()
+
+
 @pytest.mark.parametrize("power", [1.15, 1.35])
 def test_points_that_err_by_more_than_in_proportion_count_for_less(power):
     rng, noise = np.random.default_rng(1), PointNoise()

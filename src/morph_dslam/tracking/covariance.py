@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.patches import FAST
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
@@ -125,6 +126,8 @@ def gaussian_factor(places: Array, length: float) -> Array:
 
 #: Eigenvalue floor, relative to the best-seen direction.
 EIGENVALUE_FLOOR = 1e-12
+#: An unknown of which the others leave less than this share of its information may not be seen at all.
+LEAST_PIVOT = 1e-8
 
 
 #: Nothing is known better than by this, pixels, whatever residuals and patches say: a frame that is the reference
@@ -173,9 +176,52 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
         sigma = np.median(np.sqrt(weights) * length) / 0.6745 * np.sqrt(count / freedom)
     mean_slope = max(slopes / len(numbers), 1e-3)
     variance = max(psi_squared / freedom * (factors / len(numbers)) / mean_slope**2, LEAST_SPREAD_PX**2)
-    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    floored = np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)
-    return max(sigma, LEAST_SPREAD_PX), variance * ((vectors / floored) @ vectors.T) * np.outer(scale, scale)
+    sizes = np.outer(scale, scale)
+    return max(sigma, LEAST_SPREAD_PX), variance * floored_inverse(hessian * sizes) * sizes
+
+
+@njit(cache=True, nogil=True)
+def floored_inverse(hessian):
+    """Inverse of a Hessian (k, k), no eigenvalue of which counts as less than `EIGENVALUE_FLOOR` of the largest."""
+    inverse = _definite_inverse(hessian)
+    if len(inverse) == len(hessian):
+        return inverse
+    values, vectors = np.linalg.eigh(hessian)
+    return (vectors / np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)) @ vectors.T
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _definite_inverse(matrix):
+    """Inverse of a matrix (k, k) that is clearly positive definite, by its Cholesky factor; else empty, (0, 0)."""
+    n, factor = len(matrix), matrix.copy()
+    for i in range(n):
+        for j in range(i + 1):
+            first, second = factor[i], factor[j]
+            total = first[j]
+            for k in range(j):
+                total -= first[k] * second[k]
+            if j < i:
+                factor[i, j] = total / second[j]
+            elif total > LEAST_PIVOT * matrix[i, i]:
+                factor[i, i] = np.sqrt(total)
+            else:
+                return np.empty((0, 0))
+    columns, inverse = np.zeros((n, n)), np.empty((n, n))  # columns of the factor's inverse, as rows
+    for j in range(n):
+        column = columns[j]
+        column[j] = 1.0 / factor[j, j]
+        for i in range(j + 1, n):
+            row, total = factor[i], 0.0
+            for k in range(j, i):
+                total += row[k] * column[k]
+            column[i] = -total / row[i]
+    for i in range(n):
+        for j in range(i + 1):
+            first, second, total = columns[i], columns[j], 0.0
+            for k in range(i, n):
+                total += first[k] * second[k]
+            inverse[i, j] = inverse[j, i] = total
+    return inverse
 
 
 @njit(cache=True, nogil=True)

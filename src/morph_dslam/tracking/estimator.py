@@ -166,18 +166,17 @@ def _fill_derivatives(rows, fields, slopes, turned, rotation):
     rotation : (3, 3) of camera_from_object.
     """
     d, n_points = fields.shape[0] - 1, turned.shape[1]
+    own = np.empty((3, n_points))
     for which in range(2):
         begin, end = which * n_points, (which + 1) * n_points
         u, v, w = slopes[which, 0], slopes[which, 1], slopes[which, 2]
+        for c in range(3):  # by the displacement in the object's axes
+            for j in range(n_points):
+                own[c, j] = rotation[0, c] * u[j] + rotation[1, c] * v[j] + rotation[2, c] * w[j]
         for k in range(d):
             line, field = rows[k, begin:end], fields[k + 1]
             for j in range(n_points):
-                s0, s1, s2 = field[j, 0], field[j, 1], field[j, 2]
-                line[j] = (
-                    u[j] * (rotation[0, 0] * s0 + rotation[0, 1] * s1 + rotation[0, 2] * s2)
-                    + v[j] * (rotation[1, 0] * s0 + rotation[1, 1] * s1 + rotation[1, 2] * s2)
-                    + w[j] * (rotation[2, 0] * s0 + rotation[2, 1] * s1 + rotation[2, 2] * s2)
-                )
+                line[j] = own[0, j] * field[j, 0] + own[1, j] * field[j, 1] + own[2, j] * field[j, 2]
         tx, ty, tz = turned[0], turned[1], turned[2]
         about_x, about_y, about_z = rows[d, begin:end], rows[d + 1, begin:end], rows[d + 2, begin:end]
         right, down, ahead = rows[d + 3, begin:end], rows[d + 4, begin:end], rows[d + 5, begin:end]
