@@ -100,32 +100,29 @@ def _overlaps(pixels, window):
     """Values, columns and beginnings of the rows of the sparse matrix of shared windows."""
     count = len(pixels)
     from_left = np.argsort(np.where(np.isfinite(pixels[:, 0]), pixels[:, 0], np.inf))
-    places = pixels[from_left]
-    capacity, n_pairs, found = 16 * count, 0, np.ones(count, np.int32)
-    pairs, shares = np.empty((capacity, 2), np.int32), np.empty(capacity)
+    x, y, found = pixels[from_left, 0], pixels[from_left, 1], np.ones(count, np.int32)
     for a in range(count):
-        for b in range(a + 1, count):
-            right, down = places[b, 0] - places[a, 0], abs(places[b, 1] - places[a, 1])
-            if not right < window:
-                break
-            if down < window:
-                if n_pairs == capacity:
-                    capacity *= 2
-                    pairs, shares = np.concatenate((pairs, np.empty_like(pairs))), np.append(shares, np.empty(n_pairs))
-                i, j = from_left[a], from_left[b]
-                pairs[n_pairs, 0], pairs[n_pairs, 1] = i, j
-                shares[n_pairs] = (1.0 - right / window) * (1.0 - down / window)
-                found[i] += 1
-                found[j] += 1
-                n_pairs += 1
+        b = a + 1
+        while b < count and x[b] < x[a] + window:
+            if abs(y[b] - y[a]) < window:
+                found[from_left[a]] += 1
+                found[from_left[b]] += 1
+            b += 1
     begins = np.zeros(count + 1, np.int32)
     begins[1:] = np.cumsum(found)
     values, columns, ends = np.ones(begins[-1]), np.empty(begins[-1], np.int32), begins[:-1] + 1
     columns[begins[:-1]] = np.arange(count)
-    for k in range(n_pairs):
-        for i, j in ((pairs[k, 0], pairs[k, 1]), (pairs[k, 1], pairs[k, 0])):
-            values[ends[i]], columns[ends[i]] = shares[k], j
-            ends[i] += 1
+    for a in range(count):
+        i, b = from_left[a], a + 1
+        while b < count and x[b] < x[a] + window:
+            down = abs(y[b] - y[a])
+            if down < window:
+                j, share = from_left[b], (1.0 - (x[b] - x[a]) / window) * (1.0 - down / window)
+                values[ends[i]], columns[ends[i]] = share, j
+                values[ends[j]], columns[ends[j]] = share, i
+                ends[i] += 1
+                ends[j] += 1
+            b += 1
     return values, columns, begins
 
 
