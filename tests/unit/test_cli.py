@@ -1,8 +1,12 @@
 """The command line: exit statuses, messages, and a quick start."""
 
+import argparse
 import os
+import signal
 import subprocess
 import sys
+import time
+from importlib import import_module
 
 import pytest
 
@@ -108,3 +112,52 @@ def test_frame_ranges(text, expected):
 def test_wrong_frame_ranges(text, refused):
     command = ["track", "video.mp4", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "r"]
     assert "is not a range of frames such as 9-100" in refused(*command, f"--range={text}")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_waits_until_a_module_is_imported(number, capsys, tmp_path, monkeypatch):
+    """Compiled modules turn it into errors of their own, as this one does."""
+    (tmp_path / "interrupted_module.py").write_text(
+        "import signal\n"
+        "try:\n"
+        f"    signal.raise_signal({int(number)})\n"
+        "except KeyboardInterrupt as error:\n"
+        "    raise ImportError('initialization failed') from error\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "interrupted_module", raising=False)
+    imported = []
+
+    def action(_):
+        imported.append(import_module("interrupted_module"))
+        time.sleep(30.0)
+        imported.append("not interrupted")
+
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    assert cli.run_and_report_errors(action, argparse.Namespace(), "one module is imported") == 130
+    assert len(imported) == 1
+    assert capsys.readouterr().err == "\nmorph: interrupted; one module is imported\n"
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_is_not_lost_where_errors_cannot_be_raised(number, capsys):
+    """As where an object is deleted; Cython code does the same."""
+
+    class Deleted:
+        def __del__(self):
+            signal.raise_signal(number)
+
+    gone_on = []
+
+    def action(_):
+        Deleted()
+        gone_on.append("behind it")
+        time.sleep(30.0)
+        gone_on.append("not interrupted")
+
+    hooks = sys.unraisablehook, sys.excepthook
+    assert cli.run_and_report_errors(action, argparse.Namespace(), "it went on") == 130
+    assert gone_on == ["behind it"]
+    assert capsys.readouterr().err == "\nmorph: interrupted; it went on\n"
+    assert (sys.unraisablehook, sys.excepthook) == hooks

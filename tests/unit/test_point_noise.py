@@ -78,7 +78,7 @@ def test_residuals_of_nothing_do_not_make_an_estimate_exact():
 
 @pytest.mark.parametrize("unseen", [[], [4], [0, 7]])
 def test_what_points_do_not_see_leaves_the_covariance_of_all_else(unseen):
-    """Ten unknowns of sizes a thousand apart: NumPy's inverse of those that are seen, and next to nothing of the rest."""
+    """Ten unknowns of sizes a thousand apart: NumPy's inverse of those that are seen."""
     rng = np.random.default_rng(7)
     jacobian, seen = rng.standard_normal((400, 10)) * np.logspace(-1.5, 1.5, 10), np.ones(10, dtype=bool)
     jacobian[:, unseen], seen[unseen] = 0.0, False
