@@ -9,17 +9,13 @@ from __future__ import annotations
 import argparse
 import os
 import select
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from types import FrameType, TracebackType
-from typing import Any
 
 from morph_dslam._version import __version__
 from morph_dslam.cli.arguments import with_signed_sections
+from morph_dslam.cli.interruption import Interruption
 from morph_dslam.errors import MorphError
 
 #: Commands in the order in which `morph --help` lists them.
@@ -31,11 +27,6 @@ USER_ERROR = 2
 INTERRUPTED = 130
 #: Whoever read the output has stopped, `morph info sheet.morph | head` say: as a shell reports SIGPIPE.
 OUTPUT_CLOSED = 141
-#: What is done as a whole, by the names of Python's own files: a compiled module whose import is interrupted fails with
-#: an error of its own, a pool whose processes are just being started waits for ever.
-WHOLE = ("<frozen importlib", "concurrent/futures/process.py")
-#: An interrupt that meets one of these comes again after so many seconds.
-LATER_S = 0.05
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -52,74 +43,6 @@ def new_parser() -> argparse.ArgumentParser:
         command.set_defaults(run=module.run, kept=module.KEPT)
         module.add_arguments(command)
     return parser
-
-
-class _Interruption:
-    """Ctrl-C, or SIGTERM as batch systems send it: the command ends, workers stop, results are kept."""
-
-    def __init__(self) -> None:
-        self._number: int = signal.SIGINT
-        self._later: threading.Timer | None = None
-
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        """Raise KeyboardInterrupt, once no module is being imported and no process started."""
-        self._number = number
-        if not _is_whole(frame):
-            raise KeyboardInterrupt
-        self._come_again()
-
-    def _come_again(self) -> None:
-        self._later = threading.Timer(LATER_S, signal.pthread_kill, [threading.get_ident(), self._number])
-        self._later.start()
-
-    @contextmanager
-    def taken(self) -> Iterator[None]:
-        """Raise KeyboardInterrupt where one comes."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        numbers = [signal.SIGTERM]
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, as in the background
-            numbers.append(signal.SIGINT)
-        before = [(number, signal.signal(number, self._take)) for number in numbers]
-        try:
-            with self._not_lost():
-                yield
-        finally:
-            for number, handler in before:
-                signal.signal(number, handler)
-            if self._later is not None:
-                self._later.cancel()
-
-    @contextmanager
-    def _not_lost(self) -> Iterator[None]:
-        """Raise again what met compiled code that can only print errors and go on; nothing is printed."""
-        unraisable, uncaught = sys.unraisablehook, sys.excepthook
-
-        def take_unraisable(lost: Any) -> None:
-            if issubclass(lost.exc_type, KeyboardInterrupt):
-                self._come_again()
-            else:
-                unraisable(lost)
-
-        def take_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-            if not issubclass(kind, KeyboardInterrupt):
-                uncaught(kind, error, trace)
-
-        sys.unraisablehook, sys.excepthook = take_unraisable, take_uncaught
-        try:
-            yield
-        finally:
-            sys.unraisablehook, sys.excepthook = unraisable, uncaught
-
-
-def _is_whole(frame: FrameType | None) -> bool:
-    """Whether what a command does in a frame is one of `WHOLE`."""
-    while frame is not None and frame.f_code is not run_and_report_errors.__code__:
-        if any(name in frame.f_code.co_filename for name in WHOLE):
-            return True
-        frame = frame.f_back
-    return False
 
 
 def _output_is_closed() -> bool:
@@ -144,7 +67,7 @@ def run_and_report_errors(
     0; 2 for a mistake the user can mend; 130 if interrupted; 141 if nobody reads what it prints any more.
     """
     try:
-        with _Interruption().taken():
+        with Interruption(run_and_report_errors).taken():
             action(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
