@@ -49,13 +49,22 @@ def test_the_outline_takes_out_most_of_what_clicks_are_off_by():
     assert 0.5 < np.sqrt(np.mean(np.square(in_deviations))) < 1.6
 
 
+@pytest.mark.parametrize("seed", [8, 9, 10, 30, 32, 34])
+def test_a_state_that_misses_part_of_the_outline_does_not_fit_best(seed):
+    """Nearly flat sheets, whose landmarks hardly tell to which side they bend: up to 23 mm off where that misled."""
+    truth = sheet_state(0.12 * (seed % 10))
+    image, landmarks = SheetFilm(MODEL, seed=seed).frame(truth), clicked(truth, seed)
+    found = register_landmarks(MODEL, CAMERA, landmarks, image=image)
+    assert mean_error(MODEL, found.state, truth) < 1e-3
+
+
 def with_margin(margin):
     """The sheet with a margin all around that its mesh does not have."""
     sides = np.abs(MODEL.nodes) > [0.2099, 0.1484, 1.0]
     return replace(MODEL, nodes=MODEL.nodes + margin * sides * np.sign(MODEL.nodes))
 
 
-@pytest.mark.parametrize(("seed", "why"), [(0, OutlineUnseen), (1, OutlineUnseen), (2, OutlineContradicts)])
+@pytest.mark.parametrize(("seed", "why"), [(0, OutlineContradicts), (1, OutlineUnseen), (2, OutlineContradicts)])
 def test_a_sheet_that_is_larger_than_its_mesh_is_left_to_the_landmarks(seed, why):
     truth = sheet_state(0.3)
     image, landmarks = SheetFilm(with_margin(0.006)).frame(truth), clicked(truth, seed, sigma_px=0.5)

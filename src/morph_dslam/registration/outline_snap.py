@@ -1,10 +1,10 @@
 """A registration by landmarks, corrected by the object's outline in the same frame.
 
 Landmarks that people set are off by a pixel or two each, an outline of a hundred points only by a fraction of one. So
-the outline is searched for where the landmarks have it, and pose and parameters are fitted to both. How exact the
-outline is, and how many of its points count as one because they err alike, is seen from what the fit leaves of it
-(`tracking.outline_weight`). Where too little of the outline is seen, or where it pulls the object off its landmarks, it
-is not believed.
+the outline is searched for where the landmarks have it, and near there where they tell least, and pose and parameters
+are fitted to both. How exact the outline is, and how many of its points count as one because they err alike, is seen
+from what the fit leaves of it (`tracking.outline_weight`). Where too little of the outline is seen, where it fits worse
+than landmarks do, or where it pulls the object off them, it is not believed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.special import fdtrc
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.messages import OutlineContradicts, OutlineUnseen, RegistrationWarning
 from morph_dslam.tracking.binding import DrawnSurface
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.outline import Outline, OutlineMeasurement
 from morph_dslam.tracking.outline_weight import LEAST_SPREAD_PX, OutlineBalance
 
@@ -31,6 +31,11 @@ LEAST_SEEN = 0.5
 #: Rise of the chi-squared that excludes a minimum: three standard deviations. Mean distance, as a share of the object's
 #: size, by which states differ.
 EXCLUDED, DISTINCT_SHARE = 9.0, 0.02
+#: A point of the outline counts for no more than if it were so many squared standard deviations off.
+MOST_SQUARED = 9.0
+#: The outline is also looked for from states so many standard deviations off, in so many directions that landmarks tell
+#: least of: from theirs alone it may be led to edges beside it.
+BESIDE, DIRECTIONS = 2.0, 2
 #: Chance by which landmarks of the size of error that they show fit so much worse beside the right outline.
 LEAST_CHANCE = 1e-3
 
@@ -53,17 +58,30 @@ class Snap:
     Attributes
     ----------
     estimate : the state, its covariance counts points of the outline that err alike as one.
-    chi_squared : of landmarks and outline, in their standard deviations.
+    landmarks_squared : sum of the landmarks' squared residuals, px^2.
+    outline_px : (p,) how far the outline is off each point where the state has it; infinite where it was not found.
+    variance : of a point of the outline, px^2, and redundancy : how many points err as one.
     landmarks_px : root mean square of the landmarks' residuals alone, and beside the outline.
     seen : share of the outline that was found where the state has it.
     chance : by which right landmarks fit so much worse beside the outline than alone.
     """
 
     estimate: Estimate
-    chi_squared: float
+    landmarks_squared: float
+    outline_px: Array
+    variance: float
+    redundancy: float
     landmarks_px: tuple[float, float]
     seen: float
     chance: float
+
+    def chi_squared(self, sigma: float, surest: Snap) -> float:
+        """Of landmarks off by ``sigma``, px, and of all of the outline, which is as exact as in ``surest``.
+
+        Points that were not found count, too: else a state that has the outline where there is none fits best.
+        """
+        outline = np.minimum(self.outline_px**2 / surest.variance, MOST_SQUARED).sum() / surest.redundancy
+        return self.landmarks_squared / sigma**2 + float(outline)
 
 
 class OutlineSnap:
@@ -100,35 +118,54 @@ class OutlineSnap:
         alternatives : those that landmarks and outline together cannot exclude.
         warnings : why the outline is not believed; none where it is.
         """
-        snaps = [self.snapped(state) for state in (best.state, *alternatives)]
-        seen = [snap for snap in snaps if snap.seen >= LEAST_SEEN]
+        starts = [(state, state) for state in (best.state, *alternatives)]
+        snaps = [self.snapped(*start) for start in starts + [(near, best.state) for near in self._beside(best)]]
+        # What is off by more than landmarks are is no outline, or not that of the object as it is modelled.
+        exact = [snap for snap in snaps if snap.variance <= self._sigma**2]
+        seen = [snap for snap in exact if snap.seen >= LEAST_SEEN]
         if not seen:
-            return best, tuple(alternatives), (OutlineUnseen(max(snap.seen for snap in snaps)),)
-        allowed = sorted((snap for snap in seen if snap.chance >= LEAST_CHANCE), key=lambda snap: snap.chi_squared)
+            return best, tuple(alternatives), (OutlineUnseen(max((snap.seen for snap in exact), default=0.0)),)
+        allowed = [snap for snap in seen if snap.chance >= LEAST_CHANCE]
         if not allowed:
             alone_px, beside_px = seen[0].landmarks_px
             return best, tuple(alternatives), (OutlineContradicts(beside_px, alone_px),)
-        first, *others = allowed
-        limit = first.chi_squared + EXCLUDED
-        left = [snap.estimate.state for snap in others if snap.chi_squared < limit]
-        distinct = [state for state in left if self._apart(state, first.estimate.state)]
+        surest = min(allowed, key=lambda snap: snap.variance)
+        rated = sorted(((snap.chi_squared(self._sigma, surest), snap) for snap in allowed), key=lambda each: each[0])
+        (least, first), distinct = rated[0], list[State]()
+        for chi_squared, snap in rated[1:]:
+            state = snap.estimate.state
+            if chi_squared < least + EXCLUDED and all(
+                self._apart(state, other) for other in (first.estimate.state, *distinct)
+            ):
+                distinct.append(state)
         return first.estimate, tuple(distinct), ()
 
-    def snapped(self, start: State) -> Snap:
-        """What landmarks and outline have together near a state as landmarks alone have it."""
+    def _beside(self, best: Estimate) -> list[State]:
+        """States that landmarks hardly tell from the one that they have."""
+        if not np.isfinite(best.covariance).all():
+            return []
+        box = self._estimator.box
+        values, vectors = np.linalg.eigh(best.covariance / np.outer(box.scale, box.scale))
+        steps = BESIDE * np.sqrt(np.maximum(values, 0.0)) * vectors * box.scale[:, None]
+        least_seen = steps.T[::-1][:DIRECTIONS]
+        return [box.nearest(moved(best.state, sign * step)) for step in least_seen for sign in (1.0, -1.0)]
+
+    def snapped(self, start: State, by_landmarks: State) -> Snap:
+        """What landmarks and outline have together near a state, beside the one that landmarks alone have."""
         outline = Outline(self._estimator.model, self._estimator.camera, self._surface)
-        state, sigma, variance, k = start, self._sigma, 1.0, len(self._pixels)
+        state, sigma, variance, redundancy, k = start, self._sigma, 1.0, 1.0, len(self._pixels)
         for reach in REACHES:
             seen = self._agreeing(outline.measure(self._grey, state, reach), state)
             estimate = self._estimator.estimate(*self._measured(seen, sigma, variance, state))
             balance, state = OutlineBalance(), estimate.state
             balance.learn_outline(seen, estimate.residuals[k:], self._n_unknowns)
             if np.isfinite(balance.outline.variance):
-                variance = balance.outline.redundancy * max(balance.outline.variance, LEAST_SPREAD_PX**2)
+                redundancy = balance.outline.redundancy
+                variance = redundancy * max(balance.outline.variance, LEAST_SPREAD_PX**2)
             # Few landmarks fit better alone than they were set; beside the outline they show how well.
             sigma = max(self._sigma, float(np.sqrt(np.mean(estimate.residuals[:k] ** 2))))
             outline.take_brightness(self._grey, state)
-        return self._judged(start, estimate, seen, sigma, variance)
+        return self._judged(by_landmarks, estimate, seen, sigma, variance, redundancy)
 
     @property
     def _n_unknowns(self) -> int:
@@ -163,17 +200,28 @@ class OutlineSnap:
         )
 
     def _judged(
-        self, start: State, estimate: Estimate, seen: OutlineMeasurement, sigma: float, variance: float
+        self,
+        by_landmarks: State,
+        estimate: Estimate,
+        seen: OutlineMeasurement,
+        sigma: float,
+        variance: float,
+        redundancy: float,
     ) -> Snap:
         k, n, ones = len(self._pixels), self._n_unknowns, np.ones(len(self._pixels))
-        cost, hessian, _, _ = self._estimator.evaluate(*self._measured(seen, sigma, variance, estimate.state))
+        hessian = self._estimator.evaluate(*self._measured(seen, sigma, variance, estimate.state))[1]
         alone, beside = (
-            self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0] for state in (start, estimate.state)
+            self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0]
+            for state in (by_landmarks, estimate.state)
         )
         rise = 2.0 * max(beside - alone, 0.0) / self._sigma**2 / n
+        away = np.linalg.norm(estimate.residuals[k:], axis=1)
         return Snap(
             replace(estimate, covariance=sigma**2 * self._inverse(hessian)),
-            2.0 * cost / sigma**2,
+            2.0 * beside,
+            np.where(seen.valid, away, np.inf)[seen.expected],
+            variance / redundancy,
+            redundancy,
             (float(np.sqrt(2.0 * alone / k)), float(np.sqrt(2.0 * beside / k))),
             float(seen.valid.sum()) / max(int(seen.expected.sum()), 1),
             float(fdtrc(n, max(2 * k - n, 1), rise)),
