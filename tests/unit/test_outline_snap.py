@@ -7,7 +7,7 @@ import pytest
 
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
-from morph_dslam.registration.messages import OutlineContradicts, OutlineUnseen
+from morph_dslam.registration.messages import OutlineContradicts, OutlineInexact, OutlineUnseen
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, colours, mean_error, sheet_state
 
@@ -64,7 +64,9 @@ def with_margin(margin):
     return replace(MODEL, nodes=MODEL.nodes + margin * sides * np.sign(MODEL.nodes))
 
 
-@pytest.mark.parametrize(("seed", "why"), [(0, OutlineContradicts), (1, OutlineUnseen), (2, OutlineContradicts)])
+@pytest.mark.parametrize(
+    ("seed", "why"), [(0, OutlineContradicts), (1, OutlineUnseen), (2, OutlineContradicts), (6, OutlineInexact)]
+)
 def test_a_sheet_that_is_larger_than_its_mesh_is_left_to_the_landmarks(seed, why):
     truth = sheet_state(0.3)
     image, landmarks = SheetFilm(with_margin(0.006)).frame(truth), clicked(truth, seed, sigma_px=0.5)

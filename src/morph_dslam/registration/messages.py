@@ -193,6 +193,24 @@ class OutlineUnseen(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class OutlineInexact(RegistrationWarning):
+    """The outline fits the object worse than its landmarks do.
+
+    Attributes
+    ----------
+    outline_px : standard deviation of its points, pixels.
+    landmarks_px : that of the landmarks.
+    """
+
+    template: ClassVar[str] = (
+        "the landmarks are not corrected by the outline: it is {outline_px:.1f} px off the object, the landmarks "
+        "{landmarks_px:.1f} px; part and mesh differ, or other edges were taken for the outline"
+    )
+    outline_px: float
+    landmarks_px: float
+
+
+@dataclass(frozen=True)
 class OutlineContradicts(RegistrationWarning):
     """The outline that was found pulls the object off its landmarks.
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.messages import OutlineContradicts, OutlineUnseen, RegistrationWarning
+from morph_dslam.registration.messages import OutlineContradicts, OutlineInexact, OutlineUnseen, RegistrationWarning
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.outline import Outline, OutlineMeasurement
@@ -120,14 +120,16 @@ class OutlineSnap:
         """
         starts = [(state, state) for state in (best.state, *alternatives)]
         snaps = [self.snapped(*start) for start in starts + [(near, best.state) for near in self._beside(best)]]
-        # What is off by more than landmarks are is no outline, or not that of the object as it is modelled.
-        exact = [snap for snap in snaps if snap.variance <= self._sigma**2]
-        seen = [snap for snap in exact if snap.seen >= LEAST_SEEN]
+        seen = [snap for snap in snaps if snap.seen >= LEAST_SEEN]
         if not seen:
-            return best, tuple(alternatives), (OutlineUnseen(max((snap.seen for snap in exact), default=0.0)),)
-        allowed = [snap for snap in seen if snap.chance >= LEAST_CHANCE]
+            return best, tuple(alternatives), (OutlineUnseen(max(snap.seen for snap in snaps)),)
+        exact = [snap for snap in seen if snap.variance <= self._sigma**2]
+        if not exact:
+            least_px = float(np.sqrt(min(snap.variance for snap in seen)))
+            return best, tuple(alternatives), (OutlineInexact(least_px, self._sigma),)
+        allowed = [snap for snap in exact if snap.chance >= LEAST_CHANCE]
         if not allowed:
-            alone_px, beside_px = seen[0].landmarks_px
+            alone_px, beside_px = exact[0].landmarks_px
             return best, tuple(alternatives), (OutlineContradicts(beside_px, alone_px),)
         surest = min(allowed, key=lambda snap: snap.variance)
         rated = sorted(((snap.chi_squared(self._sigma, surest), snap) for snap in allowed), key=lambda each: each[0])

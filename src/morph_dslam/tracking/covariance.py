@@ -184,7 +184,8 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
 def floored_inverse(hessian):
     """Inverse of a Hessian (k, k), no eigenvalue of which counts as less than `EIGENVALUE_FLOOR` of the largest."""
     inverse = _definite_inverse(hessian)
-    if len(inverse) == len(hessian):
+    # The traces are no less than the largest eigenvalue, and one over the least.
+    if len(inverse) == len(hessian) and np.trace(hessian) * np.trace(inverse) * EIGENVALUE_FLOOR < 1.0:
         return inverse
     values, vectors = np.linalg.eigh(hessian)
     return (vectors / np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)) @ vectors.T
