@@ -30,15 +30,17 @@ def command(folder, output, *more):
 
 def test_objects_are_known_by_what_other_keyframes_show_of_them(left_recording, tmp_path):
     """The last keyframe shows neither the side of the wedge that is filmed nor the sheet behind it."""
-    (folder, left), mean = left_recording, {}
+    (folder, left), mean, most = left_recording, {}, {}
     for name, more in (("one", ["--one-view"]), ("several", [])):
         assert main(command(folder, tmp_path / name, *more)) == 0
-        mean[name] = [
-            errors(folder, left, "sheet", tmp_path / name).mean(),
-            errors(folder, left, "wedge", tmp_path / name / "wedge").mean(),
-        ]
+        sheet, wedge = (
+            errors(folder, left, "sheet", tmp_path / name),
+            errors(folder, left, "wedge", tmp_path / name / "wedge"),
+        )
+        mean[name], most[name] = [sheet.mean(), wedge.mean()], np.percentile(sheet, 90)
     # 0.33 to 0.43 and 2.1 mm, and 0.29 to 0.32 and 0.7; 0.28 is what the keyframes' poses are off by.
     assert mean["several"][0] < min(0.4e-3, mean["one"][0])
+    assert most["several"] < 0.85 * most["one"]
     assert mean["several"][1] < min(1.0e-3, 0.5 * mean["one"][1])
 
 

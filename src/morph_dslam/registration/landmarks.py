@@ -33,7 +33,7 @@ from morph_dslam.registration.messages import (
     UnusualSize,
     WrongUnit,
 )
-from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, are_distinct, mesh_in_camera
+from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.depth import SIGMA_AT_1M
@@ -299,14 +299,8 @@ def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float
     freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
     variance = max(click_px**2, 2.0 * best.cost / freedom)
     # Twice the log-likelihood ratio of two minima.
-    plausible = [e for e in found if 2.0 * (e.cost - best.cost) < EXCLUDED * variance]
-    shapes, states = [mesh_in_camera(model, best.state)], []
-    for estimate in plausible:
-        shape = mesh_in_camera(model, estimate.state)
-        if all(are_distinct(model, shape, other) for other in shapes):
-            shapes.append(shape)
-            states.append(estimate.state)
-    return best, tuple(states)
+    plausible = [e.state for e in found if 2.0 * (e.cost - best.cost) < EXCLUDED * variance]
+    return best, distinct_states(model, best.state, plausible)
 
 
 def _check_residual(best: Estimate, rms: float, limit: float) -> None:

@@ -9,7 +9,7 @@ than landmarks do, or where it pulls the object off them, it is not believed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,10 +45,16 @@ def mesh_in_camera(model: ReducedModel, state: State) -> Array:
     return state.camera_from_object.apply(model.positions(state.parameters))
 
 
-def are_distinct(model: ReducedModel, one: Array, other: Array) -> bool:
-    """Whether the nodes (n, 3) of two states, in the camera frame, are so far apart that these are different ones."""
-    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
-    return float(np.linalg.norm(one - other, axis=1).mean()) > DISTINCT_SHARE * size
+def distinct_states(model: ReducedModel, best: State, others: Iterable[State]) -> tuple[State, ...]:
+    """Those states that differ from the best and from each other: by their nodes' mean distance."""
+    least = DISTINCT_SHARE * float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    shapes, distinct = [mesh_in_camera(model, best)], []
+    for state in others:
+        shape = mesh_in_camera(model, state)
+        if all(float(np.linalg.norm(shape - other, axis=1).mean()) > least for other in shapes):
+            shapes.append(shape)
+            distinct.append(state)
+    return tuple(distinct)
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Snap:
     Attributes
     ----------
     estimate : the state, its covariance counts points of the outline that err alike as one.
-    landmarks_squared : sum of the landmarks' squared residuals, px^2.
+    landmarks_squared : sum of the landmarks' squared residuals beside the outline, large ones by Huber's cost, px^2.
     outline_px : (p,) how far the outline is off each point where the state has it; infinite where it was not found.
     variance : of a point of the outline, px^2, and redundancy : how many points err as one.
     landmarks_px : root mean square of the landmarks' residuals alone, and beside the outline.
@@ -133,14 +139,9 @@ class OutlineSnap:
             return best, tuple(alternatives), (OutlineContradicts(beside_px, alone_px),)
         surest = min(allowed, key=lambda snap: snap.variance)
         rated = sorted(((snap.chi_squared(self._sigma, surest), snap) for snap in allowed), key=lambda each: each[0])
-        (least, first), distinct = rated[0], list[State]()
-        for chi_squared, snap in rated[1:]:
-            state = snap.estimate.state
-            if chi_squared < least + EXCLUDED and all(
-                self._apart(state, other) for other in (first.estimate.state, *distinct)
-            ):
-                distinct.append(state)
-        return first.estimate, tuple(distinct), ()
+        (least, first), *others = rated
+        left = [snap.estimate.state for chi_squared, snap in others if chi_squared < least + EXCLUDED]
+        return first.estimate, distinct_states(self._estimator.model, first.estimate.state, left), ()
 
     def _beside(self, best: Estimate) -> list[State]:
         """States that landmarks hardly tell from the one that they have."""
@@ -158,12 +159,12 @@ class OutlineSnap:
         state, sigma, variance, redundancy, k = start, self._sigma, 1.0, 1.0, len(self._pixels)
         for reach in REACHES:
             seen = self._agreeing(outline.measure(self._grey, state, reach), state)
-            estimate = self._estimator.estimate(*self._measured(seen, sigma, variance, state))
+            estimate = self._estimator.estimate(*self._measured(seen, sigma, redundancy * variance, state))
             balance, state = OutlineBalance(), estimate.state
             balance.learn_outline(seen, estimate.residuals[k:], self._n_unknowns)
             if np.isfinite(balance.outline.variance):
                 redundancy = balance.outline.redundancy
-                variance = redundancy * max(balance.outline.variance, LEAST_SPREAD_PX**2)
+                variance = max(balance.outline.variance, LEAST_SPREAD_PX**2)
             # Few landmarks fit better alone than they were set; beside the outline they show how well.
             sigma = max(self._sigma, float(np.sqrt(np.mean(estimate.residuals[:k] ** 2))))
             outline.take_brightness(self._grey, state)
@@ -173,11 +174,6 @@ class OutlineSnap:
     def _n_unknowns(self) -> int:
         box = self._estimator.box
         return int((box.upper > box.lower).sum()) + 6
-
-    def _apart(self, one: State, other: State) -> bool:
-        """Whether two states are different ones."""
-        model = self._estimator.model
-        return are_distinct(model, mesh_in_camera(model, one), mesh_in_camera(model, other))
 
     def _agreeing(self, seen: OutlineMeasurement, state: State) -> OutlineMeasurement:
         """Those points of an outline that are as far off the state as most of them, or less."""
@@ -211,7 +207,7 @@ class OutlineSnap:
         redundancy: float,
     ) -> Snap:
         k, n, ones = len(self._pixels), self._n_unknowns, np.ones(len(self._pixels))
-        hessian = self._estimator.evaluate(*self._measured(seen, sigma, variance, estimate.state))[1]
+        hessian = self._estimator.evaluate(*self._measured(seen, sigma, redundancy * variance, estimate.state))[1]
         alone, beside = (
             self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0]
             for state in (by_landmarks, estimate.state)
@@ -222,7 +218,7 @@ class OutlineSnap:
             replace(estimate, covariance=sigma**2 * self._inverse(hessian)),
             2.0 * beside,
             np.where(seen.valid, away, np.inf)[seen.expected],
-            variance / redundancy,
+            variance,
             redundancy,
             (float(np.sqrt(2.0 * alone / k)), float(np.sqrt(2.0 * beside / k))),
             float(seen.valid.sum()) / max(int(seen.expected.sum()), 1),
