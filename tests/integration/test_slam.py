@@ -104,6 +104,14 @@ def test_a_camera_that_only_turns_waits_and_says_why():
     assert frames[-1].reason == NoPose(SlamReason.ONLY_TURNED)
 
 
+def test_a_film_that_starts_no_map_ends_with_a_rolling_shutter_too():
+    film = RoomFilm(seed=3)
+    still = [film.frame(pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))] * 3
+    scene = map_scene(Film(still), replace(CAMERA, readout_s=0.02))
+    assert len(scene.trajectory.indices) == 0
+    assert not scene.map.keyframes
+
+
 def test_films_that_show_no_motion_start_nothing(room_film):
     rng, black = np.random.default_rng(0), Slam(CAMERA)
     assert {frame.reason for frame in follow(black, [BLACK] * 8)} == {NoPose(SlamReason.LITTLE_TEXTURE, (0,))}

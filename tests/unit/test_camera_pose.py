@@ -137,6 +137,16 @@ def test_two_views_of_a_plane_give_the_motion_among_others(points):
     assert errors.max(axis=1).min() < 0.05
 
 
+def test_a_way_around_a_wall_is_no_turn(points):
+    """Most points are on a wall that the camera turns about; what stands before it tells that the camera moved."""
+    points[:, 2] = np.where(np.arange(200) % 6, 4.0, 2.5)
+    around = rigid_pose([0.0, 0.0, 0.0], [0.0, 0.05, 0.0])
+    around[:3, 3] = np.array([0.0, 0.0, 4.0]) - around[:3, :3] @ [0.0, 0.0, 4.0]
+    residual = turn_residual_px(pixels_of(np.eye(4), points), pixels_of(around, points), INTRINSICS)
+    # The camera moved by 4 sin(0.05) beside points that are 1.5 nearer than what a turn explains.
+    assert residual == pytest.approx(520.0 * 4.0 * np.sin(0.05) * (1 / 2.5 - 1 / 4.0), rel=0.15)
+
+
 def test_a_turn_leaves_nothing_and_a_shift_its_parallax(points):
     turned = rigid_pose([0.0, 0.0, 0.0], [0.02, 0.2, 0.1])
     first = pixels_of(np.eye(4), points)

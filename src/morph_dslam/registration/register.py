@@ -145,9 +145,9 @@ def _camera_poses(scene: Scene) -> dict[int, NDArray[np.float64]]:
 def _camera_in(poses: dict[int, NDArray[np.float64]], frame: int, hint: str) -> RigidTransform:
     """The camera's pose in a frame that a hint names; raises RegistrationError if the map has none."""
     if frame not in poses:
+        nearest = min(poses, key=lambda other: abs(other - frame))
         raise RegistrationError(
-            f"frame {frame} has no pose in the map, which has frames {min(poses)}-{max(poses)}: set the {hint} "
-            "in one of these"
+            f"frame {frame} has no pose in the map: set the {hint} in frame {nearest}, the nearest that has one"
         )
     return RigidTransform.from_matrix(poses[frame])
 

@@ -26,6 +26,8 @@ Mask = NDArray[np.bool_]
 START_CORNERS = 500
 #: Median angle between the first two views' rays, degrees.
 START_PARALLAX_DEG = 1.2
+#: Share of the points that a turn of the camera must explain: most may lie on one wall that the camera turns about.
+TURNED_SHARE = 0.9
 #: Error in pixels, and share of the points that must fit, in three views.
 START_RMS_PX, START_SHARE = 1.0, 0.9
 #: How much larger a rejected hypothesis' squared error must be than the accepted one's.
@@ -67,7 +69,7 @@ class MapStart:
 
 
 def turn_residual_px(first: Array, second: Array, intrinsics: Array) -> float:
-    """Median distance, in pixels, that a pure turn of the camera leaves between matched pixels (n, 2)."""
+    """Distance, in pixels, that a pure turn of the camera leaves at most in `TURNED_SHARE` of matched pixels (n, 2)."""
     a, b = rays(first, intrinsics), rays(second, intrinsics)
     unit_a, unit_b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
     used = np.ones(len(a), dtype=bool)
@@ -78,7 +80,7 @@ def turn_residual_px(first: Array, second: Array, intrinsics: Array) -> float:
         moved = a @ rotation.T
         distance = np.linalg.norm((moved[:, :2] / moved[:, 2:] - b[:, :2]) * intrinsics[:2], axis=1)
         used = distance <= np.quantile(distance, 0.7)
-    return float(np.median(distance))
+    return float(np.quantile(distance, TURNED_SHARE))
 
 
 class MapInitializer:

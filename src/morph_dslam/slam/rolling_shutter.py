@@ -157,7 +157,7 @@ def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> 
     rows = {index: row for row, index in enumerate(trajectory.indices.tolist())}
     twists = velocities(trajectory.timestamps, trajectory.camera_from_world)
     kept = rigid_map.kept_keyframes
-    row_of = np.array([rows.get(rigid_map.keyframes[k].index, -1) for k in kept])
+    row_of = np.array([rows.get(rigid_map.keyframes[k].index, -1) for k in kept], dtype=np.int64)
     known = row_of >= 0
     known[known] = np.isfinite(twists[row_of[known]]).all(axis=1)
     if known.sum() < 2:
