@@ -33,6 +33,9 @@ LEAST_EDGE, PARALLEL = 3.0, 0.8
 REACHES = (16, 12, 10, 8, 6, 5, 4, 3, 3, 3)
 #: Standard deviation of an edge's place and of a keyframe's own shift, pixels.
 EDGE_PX, SHIFT_PX = 1.0, 2.0
+#: Where a smooth surface turns away it is shaded, and its edge in the image seems to lie inside or outside of its
+#: outline: by this standard deviation, pixels, in all views alike.
+INWARD_PX = 0.7
 #: So many points of a view's edges count as independent.
 INDEPENDENT = 40.0
 #: Standard deviation of a landmark that was clicked, pixels.
@@ -93,29 +96,30 @@ def find_edges(slope_x, slope_y, pixels, normals, reach, least):
 
 
 @njit(cache=True, nogil=True)
-def edge_equations(points, turned_about, normals, offsets, reach, intrinsics):
-    """Normal equations of a pose's step and of the image's own shift by edges found along normals.
+def edge_equations(points, turned_about, normals, smooth, offsets, reach, intrinsics, inward_px):
+    """Normal equations (7, 7) of a pose's step by edges found along normals, the right side as last row and column.
 
-    Edges that were not found, at NaN, do not count.
+    Edges that were not found, at NaN, do not count. The image's own shift is eliminated, and so is how far outwards
+    smooth outlines seem to be.
 
     Parameters
     ----------
     points : (p, 3) of the edges, in the camera.
     turned_about : (3,) the point about which the pose's step turns, as in `pose_jacobian`.
-    normals : (p, 2) across the edges.
+    normals : (p, 2) across the edges, outwards where these are smooth.
+    smooth : (p,) whether a smooth surface turns away there.
     offsets : (p,) where they were found along these, pixels.
     reach : pixels searched.
     intrinsics : fx, fy, cx, cy.
-
-    Returns
-    -------
-    Matrix and right side (7, 7) of the pose's step, the latter as last row and column; the same against the shift
-    (7, 2); and the shift's matrix (2, 2).
+    inward_px : standard deviation of a view's smooth outlines, all together.
     """
     count, width = np.isfinite(offsets).sum(), max(0.5 * reach, 1.5)
     # Neighbours share their errors: a view's edges count as so many independent points.
     independent = min(1.0, INDEPENDENT / max(count, 1)) / EDGE_PX**2
-    own, by_shift, shift, row = np.zeros((7, 7)), np.zeros((7, 2)), np.eye(2) / SHIFT_PX**2, np.empty(7)
+    # The pose's step, the right side, the shift, and that of smooth outlines.
+    matrix, row = np.zeros((10, 10)), np.empty(10)
+    matrix[7, 7] = matrix[8, 8] = 1.0 / SHIFT_PX**2
+    matrix[9, 9] = 1.0 / inward_px**2
     for p in range(len(points)):
         if not np.isfinite(offsets[p]):
             continue
@@ -125,22 +129,24 @@ def edge_equations(points, turned_about, normals, offsets, reach, intrinsics):
         x, y, z = points[p] - turned_about
         row[0], row[1], row[2] = y * c - z * b, z * a - x * c, x * b - y * a
         row[3], row[4], row[5], row[6] = a, b, c, offsets[p]
+        row[7], row[8], row[9] = normals[p, 0], normals[p, 1], 1.0 if smooth[p] else 0.0
         weight = independent / (1.0 + (offsets[p] / width) ** 2) ** 2
-        for i in range(7):
-            for j in range(7):
-                own[i, j] += weight * row[i] * row[j]
-            for j in range(2):
-                by_shift[i, j] += weight * row[i] * normals[p, j]
-        for i in range(2):
-            for j in range(2):
-                shift[i, j] += weight * normals[p, i] * normals[p, j]
-    return own, by_shift, shift
+        for i in range(10):
+            for j in range(i + 1):
+                matrix[i, j] += weight * row[i] * row[j]
+    for k in (9, 8, 7):
+        for i in range(k):
+            for j in range(i + 1):
+                matrix[i, j] -= matrix[k, i] * matrix[k, j] / matrix[k, k]
+    for i in range(7):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
+    return matrix[:7, :7]
 
 
 @njit(cache=True, nogil=True)
-def view_equations(edges, rotation, translation, intrinsics, width, height, slope_x, slope_y, reach):
-    """Normal equations (7, 7) of a pose's step, whose right side is the last row and column; zero if a view shows
-    too few edges. The view's own shift is eliminated.
+def view_equations(edges, rotation, translation, intrinsics, width, height, slope_x, slope_y, reach, inward_px):
+    """Normal equations (7, 7) of a pose's step by a view's edges (`edge_equations`); zero if it shows too few.
 
     Parameters
     ----------
@@ -148,21 +154,15 @@ def view_equations(edges, rotation, translation, intrinsics, width, height, slop
     rotation, translation, intrinsics, width, height : of the view, as of `seen_from`.
     slope_x, slope_y : (h, w) change of grey in a pixel to the right and downwards.
     reach : pixels to search to either side.
+    inward_px : as of `edge_equations`.
     """
-    _, points, pixels, normals, _ = see_edges(edges, rotation, translation, intrinsics, width, height)
+    rows, points, pixels, normals, _ = see_edges(edges, rotation, translation, intrinsics, width, height)
     if len(points) < FEWEST:
         return np.zeros((7, 7))
     offsets = find_edges(slope_x, slope_y, pixels, normals, reach, LEAST_EDGE)
     if np.isfinite(offsets).sum() < FEWEST:
         return np.zeros((7, 7))
-    own, by_shift, shift = edge_equations(points, translation, normals, offsets, reach, intrinsics)
-    determinant = shift[0, 0] * shift[1, 1] - shift[0, 1] * shift[1, 0]
-    for i in range(7):
-        first = (shift[1, 1] * by_shift[i, 0] - shift[0, 1] * by_shift[i, 1]) / determinant
-        second = (shift[0, 0] * by_shift[i, 1] - shift[1, 0] * by_shift[i, 0]) / determinant
-        for j in range(7):
-            own[i, j] -= first * by_shift[j, 0] + second * by_shift[j, 1]
-    return own
+    return edge_equations(points, translation, normals, ~edges.sharp[rows], offsets, reach, intrinsics, inward_px)
 
 
 @dataclass(frozen=True)
@@ -313,11 +313,13 @@ class EdgeImages:
     def _equations(
         self, edges: MeshEdges, place: SimilarityTransform, reach: float, centre: Array
     ) -> tuple[Array, Array]:
-        """Normal matrix (7, 7) and right side (7,), the keyframes' own shifts eliminated."""
+        """Normal matrix (7, 7) and right side (7,) of a step of the place."""
         matrix, right = np.zeros((7, 7)), np.zeros(7)
+        # What all views share, each for itself: their mean is no better known than one.
+        inward_px = INWARD_PX * np.sqrt(len(self.views))
         for view, slopes in zip(self.views, self.slopes, strict=True):
             pose = camera_from_object(view, place)
-            own = view_equations(edges.arrays, *seen_from(pose, self.camera), *slopes, float(reach))
+            own = view_equations(edges.arrays, *seen_from(pose, self.camera), *slopes, float(reach), inward_px)
             by_place = similarity_jacobian(pose, place, centre)
             matrix += by_place.T @ own[:6, :6] @ by_place
             right += by_place.T @ own[:6, 6]

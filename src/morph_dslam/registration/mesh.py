@@ -24,6 +24,7 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
+from morph_dslam.registration.increments import step_between
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
 from morph_dslam.registration.messages import (
     Ambiguity,
@@ -77,9 +78,15 @@ AMBIGUOUS = 0.8
 CONFIRMED, OUTLINE_SHOWN, ONE_SIDED = 10.0, 0.5, 1.645
 #: Below this score edges that no images confirm are not enough: the points of the map are searched as well.
 SURE = 20.0
-#: Images on the object are believed before its edges unless they lose more than this part of the score; and always
-#: where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise.
-LOST, EXACT_PX = 5.0, 0.05
+#: Images on the object are believed before its edges unless they lose more than this of the score, or this part of a
+#: lower one; and always where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but
+#: noise.
+LOST, LOST_PART, EXACT_PX = 5.0, 0.2, 0.05
+#: Images that would agree as well on a flat surface tell little of where it is: they must not contradict the edges, by
+#: the squared distance in standard deviations (7 unknowns, 0.1 %).
+CONTRADICTED = 24.3
+#: A metric map's unit may be off by this part (`register.METRIC_SCALE_STD`, three times).
+UNIT_OFF = 0.03
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -106,7 +113,7 @@ class MeshRegistration:
     keyframes : those with a pose of their own about the object; None if there was too little to compare.
     outline : how much of its outline the keyframes show where it is.
     unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
-        wall, say, that have its shape in another size.
+        wall, say, that have its shape in another size; or no image shows any of its outline.
     edges : how much of its edges the keyframes show, if it was found by these or they contradict the points.
     shape_shown : whether the images agree on the surface as they would on no flat one.
     """
@@ -217,6 +224,9 @@ def register_mesh(
     there = search.at(found.world_from_object)
     if score >= CONFIRMED and there.rank < AMBIGUOUS * places[0].rank:
         return by_edges()
+    if not there.edges.count and not found.shape_shown:
+        # Large enough, an object fits around everything, and its surface to any plane.
+        return replace(found, unconfirmed=True)
     informative = 0.0 < there.edges.chance < TELLING_CHANCE
     return replace(found, edges=there.edges) if informative and there.edges.gain < AGAINST else found
 
@@ -261,10 +271,18 @@ def _by_edges(
         metric,
     )
     there, keyframes = search.at(adjusted.world_from_object), adjusted.keyframes
-    if keyframes is None or (100.0 * there.rank < score - LOST and keyframes.rms_px > EXACT_PX):
+    if not aligned.shows_its_shape and _contradicts(adjusted.world_from_object, best, nodes.mean(axis=0)):
+        return found
+    if keyframes is None or (100.0 * there.rank < score - min(LOST, LOST_PART * score) and keyframes.rms_px > EXACT_PX):
         return found
     outline = outline_fit(adjusted.world_from_object, nodes, triangles, asked, search.camera)
     return replace(adjusted, edges=there.edges, outline=outline)
+
+
+def _contradicts(place: SimilarityTransform, by_edges: EdgeRegistration, mean_node: Array) -> bool:
+    """Whether a place is elsewhere than edges allow."""
+    step = step_between(by_edges.place, place, mean_node)
+    return float(step @ np.linalg.pinv(by_edges.covariance, hermitian=True) @ step) > CONTRADICTED
 
 
 def _by_points(
@@ -385,7 +403,7 @@ def _chosen(candidates: list[_Place], aligned: list[Agreement | None], surface: 
     moved = [place.transform if found is None else found.place for place, found in zip(compared, aligned, strict=True)]
     misfits = np.array([np.inf if found is None else found.rms_px for found in aligned])
     row = int(np.argmin(misfits))  # the first where no images can be compared
-    best, place = compared[row].evidence, moved[row]
+    best, place, refined = compared[row].evidence, moved[row], aligned[row]
     others = [Rival(other.transform, other.evidence.score) for other in candidates[len(compared) :]]
     for other, there, misfit in zip(compared, moved, misfits, strict=True):
         if misfit <= MUCH_WORSE * misfits[row] and not same_place(there, place, surface):
@@ -398,6 +416,7 @@ def _chosen(candidates: list[_Place], aligned: list[Agreement | None], surface: 
         int(best.explained.sum()),
         float(misfits[row]) if np.isfinite(misfits[row]) else None,
         surface.axis_of_revolution,
+        shape_shown=refined is not None and refined.shows_its_shape,
     )
 
 
@@ -427,6 +446,8 @@ def register_in_unit(
             raise error from None
         if found.ambiguous:
             raise
+        if abs(np.log(found.world_from_object.scale)) < UNIT_OFF:
+            return found
         raise RegistrationError(
             "the object was not found in its size, but one of its shape that is "
             f"{found.world_from_object.scale:.4g} times as large is there, and the map is metric: correct the "

@@ -47,6 +47,8 @@ TELLING_CHANCE = 0.5
 #: No other keyframe is searched if a place has such a rank, and the next one less than such a part of it. Places as
 #: good are fitted again from where each keyframe alone would have them.
 ENOUGH, MUCH_WORSE = 0.3, 0.5
+#: Sizes agree within so many standard deviations.
+SIZES_AGREE = 2.0
 #: Hypotheses are alike in a square of so many pixels and within this of the size (log); so many of them are fitted.
 CELL, SIZES_ALIKE, MOST_ALIKE = 64, 0.36, 3
 #: Pixels searched in turn for them: in one keyframe, with few, with more of them, and from near.
@@ -207,7 +209,9 @@ class EdgeSearch:
     def _polished(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
         """Distinct places, the best first, those that may be right fitted from other starts, too."""
         best = max((each.rank for each in found), default=0.0)
-        return self._distinct([self._again(each) if each.rank >= MUCH_WORSE * best else each for each in found])
+        again = [self._again(each) if each.rank >= MUCH_WORSE * best else each for each in found]
+        best = max((each.rank for each in again), default=0.0)
+        return self._distinct([self._sized(each) if each.rank >= MUCH_WORSE * best else each for each in again])
 
     def _distinct(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
         """Those that are not the same place as a better one, the best first."""
@@ -259,6 +263,21 @@ class EdgeSearch:
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
         return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.rank)
+
+    def _sized(self, found: EdgeRegistration) -> EdgeRegistration:
+        """A place with the size by its edges and the points in its outline together, unless they contradict each other.
+
+        Where edges hardly tell the size they fit in many, and chance decides in which best. What lies beside the
+        outline, as around the object's foot, is not on it.
+        """
+        seen, images = found.points, self._images(found.place)
+        rows = np.flatnonzero(seen.explained | seen.occluded | seen.hidden_by)
+        on_it = PointsOnSurface(self._dense[0][rows], self.surface, len(self._dense[1]))
+        place, covariance = images.refine(self.edges, found.place, self._metric, NEAREST, self._hints.clicks, on_it)
+        sized = replace(self.at(place), covariance=covariance * max(1, len(images.views)))
+        apart = abs(np.log(place.scale / found.place.scale))
+        agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > MUCH_WORSE * found.rank
+        return sized if agree else found
 
     def _images(self, place: SimilarityTransform) -> EdgeImages:
         """Edges of the keyframes that see the object at a place."""
