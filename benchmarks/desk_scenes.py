@@ -21,6 +21,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import morph_dslam as md
+from figurines import figurine
 from morph_dslam.extend.models import SeparatedField
 
 Array = NDArray[np.float64]
@@ -28,6 +29,8 @@ Image = NDArray[np.uint8]
 Rng = np.random.Generator
 PICTURES = ("chelsea", "rocket", "coffee", "astronaut")
 N_FRAMES, KEY_FRAMES_APART = 81, 8
+#: The first seed of a figurine, without a mark, in place of a shape with few.
+FIGURINES = 1000
 #: Boxes whose proportions differ by less than this (natural logarithm) are alike where a map has no scale.
 ALIKE = 0.2
 #: Faces that meet at a larger angle have a sharp edge, rad.
@@ -138,10 +141,12 @@ def shapes() -> dict[str, Shape]:
     }
 
 
-def shape_of(seed: int) -> str:
-    """The name of a seed's object: each in turn."""
-    names = list(shapes())
-    return names[seed % len(names)]
+def shape_of(seed: int) -> tuple[str, Shape]:
+    """A seed's object and its name: each in turn, or from `FIGURINES` on a figurine."""
+    if seed >= FIGURINES:
+        return "figurine", Shape(*figurine(seed), lies=False)
+    named = list(shapes().items())
+    return named[seed % len(named)]
 
 
 def _colour(rng: Rng, low: int = 60, high: int = 220, share: float = 1.0) -> Array:
@@ -164,6 +169,11 @@ def _marked(rng: Rng, size: int = 480) -> Image:
         else:
             cv2.ellipse(image, centre, half, 0.0, 0.0, 360.0, colour, -1, cv2.LINE_AA)
     return image
+
+
+def _yellow(rng: Rng, size: int = 64) -> Image:
+    """A print of one bright colour."""
+    return np.full((size, size, 3), rng.integers([20, 165, 200], [60, 200, 245]), dtype=np.uint8)
 
 
 def _tags(rng: Rng, columns: int, rows: int) -> Image:
@@ -227,11 +237,16 @@ def write_desk(seed: int, folder: Path) -> list[Path]:
     ``sharp.morph``, is still to be made of the first (`with_sharp_edges`).
     """
     folder.mkdir(parents=True, exist_ok=True)
-    rng, shape = np.random.default_rng([16, seed]), shapes()[shape_of(seed)]
+    rng, (_, shape) = np.random.default_rng([16, seed]), shape_of(seed)
     meshio.Mesh(shape.points, [("triangle", shape.triangles)]).write(folder / "object.stl")
     size = rng.uniform([270, 210], [420, 320])
     board = (_tags(rng, 4, 3), _page(rng, 900, 680), None)[rng.integers(3)]
-    pictures = {"marks": _marked(rng), "wood": _wood(rng), "paint": _speckled(rng), "wall": _speckled(rng)}
+    pictures = {
+        "marks": _yellow(rng) if seed >= FIGURINES else _marked(rng),
+        "wood": _wood(rng),
+        "paint": _speckled(rng),
+        "wall": _speckled(rng),
+    }
     pictures |= {} if board is None else {"board": board}
     for name, picture in pictures.items():
         cv2.imwrite(str(folder / f"{name}.png"), picture)

@@ -190,8 +190,8 @@ BENCHMARKS = {
     ),
     "live": Benchmark(
         "Tracking",
-        "Live tracking of the boot seal",
-        "python benchmarks/live.py --minutes 1",
+        "Live tracking of the boot seal, 1280x720 for ten minutes",
+        "python benchmarks/live.py --minutes 10 --size 1280x720",
         "none: frame rate, latency and memory only",
     ),
     "phone": Benchmark(

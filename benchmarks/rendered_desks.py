@@ -3,10 +3,11 @@
     python benchmarks/rendered_desks.py [--seeds N] [--first K] [--hints none distance clicks guess] [--again maps]
                                         [--cache FOLDER] [--make-only] [--pictures]
 
-A desk (desk_scenes.py) has one of 13 shapes, with few marks on it, and is filmed in 81 frames of 640x480 pixels by a
-trembling hand with a rolling shutter; SLAM maps it with one camera, so without a scale. The object is then registered
-as `morph register` does: without a hint, with a rough distance (10 to 30 % off), with four points clicked in one
-frame (1 px off each way), or with a guess in one frame (24 px aside, 8 % too near or too far, turned by 8 degrees).
+A desk (desk_scenes.py) has one of 13 shapes, with few marks on it, or from seed 1000 on a smooth animal of one colour
+(figurines.py), and is filmed in 81 frames of 640x480 pixels by a trembling hand with a rolling shutter; SLAM maps it
+with one camera, so without a scale. The object is then registered as `morph register` does: without a hint, with a
+rough distance (10 to 30 % off), with four points clicked in one frame (1 px off each way), or with a guess in one frame
+(24 px aside, 8 % too near or too far, turned by 8 degrees).
 Desks and maps are kept in the cache; ``--again maps`` makes new maps of the recordings.
 
 A registration counts as right where it is unambiguous and, in the first keyframe in which the object is registered,
@@ -32,7 +33,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import morph_dslam as md
-from desk_scenes import Shape, shape_of, shapes, with_sharp_edges, write_desk
+from desk_scenes import Shape, shape_of, with_sharp_edges, write_desk
 from morph_dslam.extend.geometry import RigidTransform, SimilarityTransform, fit_similarity
 from morph_dslam.extend.registration import Landmarks, draw_registration
 from morph_dslam.extend.slam import run_slam
@@ -162,8 +163,7 @@ def load_desk(seed: int, folder: Path) -> Desk:
         seen.rotation @ (place.scale * true[0].translation) + seen.translation,
     )
     surface = first.inverse.apply(1e-3 * truth["points_mm"][0])
-    shape = shapes()[shape_of(seed)]
-    return Desk(seed, shape, model, scene, poses, truth["pixels"], truth["visible"], surface, place)
+    return Desk(seed, shape_of(seed)[1], model, scene, poses, truth["pixels"], truth["visible"], surface, place)
 
 
 def hints_of(desk: Desk, hint: str, folder: Path) -> dict[str, object]:
@@ -264,7 +264,7 @@ def main() -> int:
         folder = made(seed, arguments.cache, arguments.again == "maps")
         desk = load_desk(seed, folder)
         points.append(desk.points)
-        start = f"seed={seed} shape={shape_of(seed)} keyframes={len(desk.scene.map.keyframes)} points={points[-1]}"
+        start = f"seed={seed} shape={shape_of(seed)[0]} keyframes={len(desk.scene.map.keyframes)} points={points[-1]}"
         if arguments.make_only:
             print(start, flush=True)
             continue
