@@ -112,6 +112,26 @@ def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
     assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
 
 
+@pytest.mark.parametrize("scale", [0.2, 1.0, 3.7])
+def test_landmarks_in_a_frame_that_is_no_keyframe_place_an_object_in_a_map_of_any_unit(scan, scale):
+    """The unit says where the points, which another view sees, lie beside the frame of the landmarks."""
+    points, views = scan
+    ratio = scale / WORLD.scale
+
+    def scaled(pose):
+        return RigidTransform(pose.rotation, pose.translation * ratio)
+
+    world = SimilarityTransform(scale, WORLD.rotation, WORLD.translation * ratio)
+    points = replace(points, positions=points.positions * ratio, viewpoints=points.viewpoints * ratio)
+    views = [replace(view, camera_from_world=scaled(view.camera_from_world)) for view in views]
+    pixels = CAMERA.project(camera_from_object(views[0], world).apply(CORNERS))
+    pixels = pixels + np.random.default_rng(1).normal(0.0, 1.0, pixels.shape)
+    hints = Hints(clicks=(Sighting(-1, views[0].camera_from_world, CORNERS, pixels),))
+    found = EdgeSearch(NODES, TRIANGLES, points, views[3:], CAMERA, False, hints).search()
+    assert apart(found[0].place, world) < 2e-3
+    assert found[0].place.scale == pytest.approx(scale, rel=0.02)
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
 def test_a_guess_within_30_pixels_places_an_object_and_gives_the_unit(scan, seed):
     points, views = scan

@@ -59,6 +59,9 @@ N_STEREO = 8
 NO_POINTS = 0.05
 #: A point lies on the object if it is so near to the surface, over the object's size.
 TOLERANCE = 0.015
+#: Units of the map that are tried where landmarks have the object: so many, from the one in which it is as far away as
+#: the points are, divided by this, to that times this.
+N_UNITS, UNIT_FROM = 9, 4.0
 #: Fewer landmarks than this in a frame are tried in so many other places, too.
 MANY_CLICKS, N_MEANT = 6, 12
 #: Factor by which a rough distance may be off.
@@ -438,12 +441,19 @@ class EdgeSearch:
         # The points are known where a keyframe sees them; the object stands still.
         view = self._beside(seen.frame)
         near = RigidTransform.from_matrix(view.camera_from_world.matrix @ np.linalg.inv(seen.camera_from_world.matrix))
-        unit = 1.0
-        for _ in range(3):
-            between = RigidTransform(near.rotation, near.translation / unit)
-            found = map_unit(between @ pose, self.edges, view, self._dense[0], self.camera)[0]
-            unit = found if found > 0.0 else unit
-        return placed(pose, seen, unit, self._metric)
+        known = view.camera_from_world.apply(self._dense[0].positions[view.point_ids])[:, 2]
+        usual = float(np.median(known)) / max(float(pose.translation[2]), 1e-9) if len(known) else 1.0
+        # In which unit the object lies in which points' way, these say only where it is nearly right.
+        best, most = 1.0, 0
+        for begun in usual * np.geomspace(1.0 / UNIT_FROM, UNIT_FROM, N_UNITS):
+            unit, agreeing = float(begun), 0
+            for _ in range(3):
+                between = RigidTransform(near.rotation, near.translation / unit)
+                found, agreeing, _ = map_unit(between @ pose, self.edges, view, self._dense[0], self.camera)
+                unit = found if found > 0.0 else unit
+            if agreeing > most:
+                best, most = unit, agreeing
+        return placed(pose, seen, best, self._metric)
 
 
 def _diverse(found: InView, speaking: Array, most: int, most_alike: int) -> list[int]:
