@@ -29,7 +29,7 @@ from morph_dslam.tracking.noise import (
 )
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement
+from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
@@ -270,7 +270,9 @@ class FrameEstimation:
                 found = self._along_contour(picture, moved, prior, REACHES[0])
                 if found.counts[1] > best.counts[1]:
                     best = found
-        return best
+        if not lost or best.outline is None:
+            return best
+        return replace(best, n_absent=n_absent(picture.grey, best.outline))
 
     def _along_contour(self, picture: Image, start: State, prior: Prior | None, reach: int) -> PoseHypothesis:
         """The outline searched for from ``start``, at most ``reach`` pixels off."""

@@ -23,6 +23,8 @@ MOST_AGREE = 0.5
 #: Of the contour's points so many must be found, and this share of them. Their residuals must spread less than this,
 #: pixels, or than this share of its extent in the image: a body that is elsewhere leaves its contour by more.
 LEAST_OF_CONTOUR, CONTOUR_SHARE, CONTOUR_PX, EXTENT_SHARE = 20, 0.4, 3.0, 0.004
+#: An object of whose contour a larger share shows what is beside it is torn or cut.
+ABSENT_SHARE = 0.2
 Array = NDArray[np.float64]
 
 
@@ -68,6 +70,8 @@ class PoseHypothesis:
     outline : of the object's rim, where it counts.
     depths : of the points that support it, where a depth camera saw them.
     discrepancy : what the shape has beyond the model's, once it was estimated.
+    n_absent : points of an outline that is alone where what is beside the object is seen in its place (`n_absent`);
+        asked after a loss only.
     """
 
     estimate: Estimate
@@ -78,6 +82,7 @@ class PoseHypothesis:
     outline: OutlineMeasurement | None = None
     depths: PointDepths | None = None
     discrepancy: Discrepancy | None = None
+    n_absent: int = 0
 
     @property
     def outline_alone(self) -> bool:
@@ -150,6 +155,8 @@ def _reject_outline(hypothesis: PoseHypothesis, visible: int, count: int) -> Rej
     needed = max(LEAST_OF_CONTOUR, int(np.ceil(CONTOUR_SHARE * visible)))
     if count < needed:
         return Rejection(RejectionReason.FEW_POINTS, count, visible, needed)
+    if hypothesis.n_absent > ABSENT_SHARE * visible:
+        return Rejection(RejectionReason.PART_ABSENT, hypothesis.n_absent, visible)
     assert hypothesis.outline is not None
     extent = float(np.linalg.norm(np.ptp(hypothesis.outline.pixels[hypothesis.outline.valid], axis=0)))
     if not hypothesis.estimate.sigma_px < max(CONTOUR_PX, EXTENT_SHARE * extent):

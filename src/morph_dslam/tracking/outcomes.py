@@ -51,6 +51,7 @@ class RejectionReason(StrEnum):
     LOOSE_AGREEMENT = "{agreeing} of {points} points agree, but only by {spread_px:.1f} px"
     NO_COMMON_SHAPE = "of {points} points found only {agreeing} agree on a shape, by {spread_px:.1f} px"
     FEW_FEATURES = "only {agreeing} features of the reference view were found again"
+    PART_ABSENT = "a part is missing: {agreeing} of {points} points of the outline show what is beside the object"
     TWO_PLACES = "it could be in two places, where {agreeing} and {points} points agree"
     CAMERAS_CONTRADICT = "the cameras contradict each other: is their calibration right?"
     NO_CAMERA = "no camera sees the object"

@@ -41,6 +41,8 @@ LEAST_CONTRAST = 10.0
 BRIGHTNESS_TOLERANCE = 0.35
 #: Grey levels by which a side may differ from it until the candidate's score halves.
 LIKELY_LEVELS = 12.0
+#: What is beside an outline: from and up to so many pixels off, within so many median deviations, by so many points.
+BESIDE_PX, SPREADS, FEWEST_KNOWN = (4, 9), 4.5, 12
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,38 @@ class OutlineMeasurement:
         """The same, with this weight for all that were found, or of them for those that agree (p,)."""
         counts = self.valid if agreeing is None else self.valid & agreeing
         return replace(self, weights=np.where(counts, weight, 0.0))
+
+
+def n_absent(grey: NDArray[np.uint8], seen: OutlineMeasurement) -> int:
+    """How many points of an outline show behind them, where the object should be, what the found ones show beside it.
+
+    Of an object that is torn or cut that is the part which is gone; what covers it looks otherwise, for the most part.
+    None where the object does not stand out from what is beside it.
+
+    Parameters
+    ----------
+    grey : (h, w) undistorted image.
+    """
+    inner, outer = (_grey_beside(grey, seen.pixels, side * seen.normals) for side in (-1.0, 1.0))
+    found, missing = seen.expected & seen.valid, seen.expected & ~seen.valid
+    known = found & np.isfinite(inner) & np.isfinite(outer)
+    if known.sum() < FEWEST_KNOWN:
+        return 0
+    beside = float(np.median(outer[known]))
+    limit = max(SPREADS * float(np.median(np.abs(outer[known] - beside))), LIKELY_LEVELS)
+    if abs(float(np.median(inner[known])) - beside) < 2.0 * limit:
+        return 0
+    with np.errstate(invalid="ignore"):
+        return int((np.abs(inner[missing] - beside) < limit).sum())
+
+
+def _grey_beside(grey: NDArray[np.uint8], pixels: Array, away: Array) -> Array:
+    """Mean grey (p,) of an image `BESIDE_PX` from pixels (p, 2) along directions (p, 2); NaN outside of it."""
+    places = np.rint(pixels[:, None] + np.arange(*BESIDE_PX)[None, :, None] * away[:, None]).astype(np.int64)
+    column, row = places[:, :, 0], places[:, :, 1]
+    inside = (column >= 0) & (row >= 0) & (column < grey.shape[1]) & (row < grey.shape[0])
+    found = grey[np.where(inside, row, 0), np.where(inside, column, 0)].mean(axis=1)
+    return np.where(inside.all(axis=1), found, np.nan)
 
 
 @dataclass(frozen=True)
