@@ -2,7 +2,6 @@
 
 import cv2
 import numpy as np
-import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -10,7 +9,6 @@ from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.registration.dense_points import PointsOnSurface
 from morph_dslam.registration.edges import EdgeImages
 from morph_dslam.registration.icp import Surface
-from morph_dslam.registration.increments import moved_similarity, step_between
 from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object
 from morph_dslam.render.model_view import looking_at
@@ -82,11 +80,3 @@ def test_a_shaded_outline_neither_shrinks_the_object_nor_its_deviation():
         away.append(np.linalg.norm(there - true))
     assert np.abs(misses).max() < 2.6
     assert np.mean(away) < 8e-3
-
-
-def test_the_step_between_two_places_leads_from_one_to_the_other():
-    rng, centre = np.random.default_rng(3), np.array([0.02, -0.01, 0.03])
-    start = SimilarityTransform(2.1, Rotation.random(random_state=1).as_matrix(), rng.normal(size=3))
-    step = rng.normal(0.0, 0.3, 7)
-    found = step_between(start, moved_similarity(start, step, centre), centre)
-    assert found == pytest.approx(step, abs=1e-12)

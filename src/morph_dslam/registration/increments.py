@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_exp, rotation_log
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_exp
 
 Array = NDArray[np.float64]
 
@@ -31,12 +31,6 @@ def moved_similarity(transform: SimilarityTransform, step: Array, centre: Array)
     rotation = rotation_exp(step[1:4]) @ transform.rotation
     place = transform.apply(centre) + step[4:]
     return SimilarityTransform(scale, rotation, place - scale * rotation @ centre)
-
-
-def step_between(start: SimilarityTransform, end: SimilarityTransform, centre: Array) -> Array:
-    """The step (7,) with which `moved_similarity` comes from one to the other."""
-    moved = end.apply(centre) - start.apply(centre)
-    return np.concatenate([[np.log(end.scale / start.scale)], rotation_log(end.rotation @ start.rotation.T), moved])
 
 
 def similarity_jacobian(pose: RigidTransform, transform: SimilarityTransform, centre: Array) -> Array:

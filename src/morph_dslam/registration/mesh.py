@@ -24,7 +24,6 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
-from morph_dslam.registration.increments import step_between
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
 from morph_dslam.registration.messages import (
     Ambiguity,
@@ -78,13 +77,9 @@ AMBIGUOUS = 0.8
 CONFIRMED, OUTLINE_SHOWN, ONE_SIDED = 10.0, 0.5, 1.645
 #: Below this score edges that no images confirm are not enough: the points of the map are searched as well.
 SURE = 20.0
-#: Images on the object are believed before its edges unless they lose more than this of the score, or this part of a
-#: lower one; and always where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but
-#: noise.
-LOST, LOST_PART, EXACT_PX = 5.0, 0.2, 0.05
-#: Images that would agree as well on a flat surface tell little of where it is: they must not contradict the edges, by
-#: the squared distance in standard deviations (7 unknowns, 0.1 %).
-CONTRADICTED = 24.3
+#: Images on the object that show its shape are believed before its edges, unless they lose more than this of the score;
+#: and always where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise.
+LOST, EXACT_PX = 5.0, 0.05
 #: A metric map's unit may be off by this part (`register.METRIC_SCALE_STD`, three times).
 UNIT_OFF = 0.03
 #: The edges speak against a place found by points below this.
@@ -213,7 +208,7 @@ def register_mesh(
     score = 100.0 * places[0].rank if places else 0.0
     by_edges = cache(partial(_by_edges, places, search, points, views, metric))
     is_clear = score >= CONFIRMED and _clear([place.rank for place in places])
-    if is_clear and (score >= SURE or by_edges().keyframes is not None):
+    if is_clear and (score >= SURE or by_edges().rms_px is not None):
         return by_edges()
     try:
         found = _by_points(search, points, views, metric, progress)
@@ -271,18 +266,13 @@ def _by_edges(
         metric,
     )
     there, keyframes = search.at(adjusted.world_from_object), adjusted.keyframes
-    if not aligned.shows_its_shape and _contradicts(adjusted.world_from_object, best, nodes.mean(axis=0)):
+    is_exact = keyframes is not None and keyframes.rms_px <= EXACT_PX
+    if keyframes is None or (100.0 * there.rank < score - LOST and not is_exact):
         return found
-    if keyframes is None or (100.0 * there.rank < score - min(LOST, LOST_PART * score) and keyframes.rms_px > EXACT_PX):
-        return found
+    if not (aligned.shows_its_shape or is_exact):
+        return replace(found, rms_px=aligned.rms_px)
     outline = outline_fit(adjusted.world_from_object, nodes, triangles, asked, search.camera)
     return replace(adjusted, edges=there.edges, outline=outline)
-
-
-def _contradicts(place: SimilarityTransform, by_edges: EdgeRegistration, mean_node: Array) -> bool:
-    """Whether a place is elsewhere than edges allow."""
-    step = step_between(by_edges.place, place, mean_node)
-    return float(step @ np.linalg.pinv(by_edges.covariance, hermitian=True) @ step) > CONTRADICTED
 
 
 def _by_points(
