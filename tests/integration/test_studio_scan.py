@@ -100,8 +100,7 @@ def test_the_place_is_drawn_where_the_object_is(studio, placed):
         pose = truth["camera_from_object"][frame]
         true = camera.project_recorded(model.nodes[used] @ pose[:3, :3].T + pose[:3, 3])
         drawn = client.call("place_overlay", frame=frame)["pixels"].reshape(-1, 2)
-        # The print has edges everywhere: they leave open what clicked landmarks do, whose deviation is 2 px.
-        assert np.linalg.norm(drawn - true, axis=1).mean() < 2.0
+        assert np.linalg.norm(drawn - true, axis=1).mean() < 1.0
         status, headers, content = client.ask("GET", f"/api/scan/{frame}")
         assert (status, headers["content-type"]) == (200, "image/jpeg")
         assert cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).shape == (

@@ -26,8 +26,9 @@ Mask = NDArray[np.bool_]
 START_CORNERS = 500
 #: Median angle between the first two views' rays, degrees.
 START_PARALLAX_DEG = 1.2
-#: Share of the points that a turn of the camera must explain: most may lie on one wall that the camera turns about.
-TURNED_SHARE = 0.9
+#: Share of the points that a turn of the camera must explain, as most may lie on one wall that it turns about; and how
+#: well, over the distance that belongs to that parallax.
+TURNED_SHARE, TURNED = 0.9, 0.55
 #: Error in pixels, and share of the points that must fit, in three views.
 START_RMS_PX, START_SHARE = 1.0, 0.9
 #: How much larger a rejected hypothesis' squared error must be than the accepted one's.
@@ -150,7 +151,7 @@ class MapInitializer:
         first, second = self._first.pixels[rows], view.pixels[rows]
         needed = np.radians(START_PARALLAX_DEG) * self._intrinsics[0]
         # No triangulation needed to see that the camera has hardly moved, or only turned.
-        if turn_residual_px(first, second, self._intrinsics) < 0.25 * needed:
+        if turn_residual_px(first, second, self._intrinsics) < TURNED * needed:
             return NoPose(SlamReason.ONLY_TURNED)
         hypotheses = two_view_hypotheses(first, second, self._intrinsics)
         if not hypotheses or hypotheses[0].good.sum() < START_SHARE * len(rows):
