@@ -241,9 +241,14 @@ def last_line(attempts: list[list[Attempt]], points: list[int], count: int) -> s
                 f"{hint}:{sum(a.is_right for a in tried)}/{len(tried)}(wrong:{sum(a.is_wrong for a in tried)})"
             )
     seconds = [each.seconds for desk in attempts for each in desk]
+    unaided = "-"
+    if plain:
+        unaided = (
+            f"{sum(each.is_right for each in plain)}/{count} wrong={sum(each.is_wrong for each in plain)} "
+            f"ambiguous={sum(each.ambiguous for each in plain)}"
+        )
     return (
-        f"right={sum(each.is_right for each in plain)}/{count} wrong={sum(each.is_wrong for each in plain)} "
-        f"ambiguous={sum(each.ambiguous for each in plain)} hinted={','.join(hinted) or '-'} "
+        f"right={unaided} hinted={','.join(hinted) or '-'} "
         f"seconds={np.median(seconds):.1f} slowest={max(seconds):.1f} points={np.median(points):.0f}"
     )
 
