@@ -80,8 +80,11 @@ SURE = 20.0
 #: Images on the object that show its shape are believed before its edges, unless they lose more than this of the score;
 #: and always where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise.
 LOST, EXACT_PX = 5.0, 0.05
-#: A metric map's unit may be off by this part (`register.METRIC_SCALE_STD`, three times).
-UNIT_OFF = 0.03
+#: Standard deviation of what all lengths of a metric map are off by together, a share: no residual of the map shows it.
+#: Data sheets of depth cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
+METRIC_SCALE_STD = 0.01
+#: An object of another size than its mesh's by less than so many of these is the same one.
+SAME_SIZE = 3.0
 #: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
@@ -105,7 +108,8 @@ class MeshRegistration:
     n_explained : points on the surface.
     rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
     axis : about which the surface can be turned without a difference, so that this angle is not known.
-    keyframes : those with a pose of their own about the object; None if there was too little to compare.
+    keyframes : those with a pose of their own about the object; None if there was too little to compare, or the images
+        do not show its shape.
     outline : how much of its outline the keyframes show where it is.
     unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
         wall, say, that have its shape in another size; or no image shows any of its outline.
@@ -436,7 +440,7 @@ def register_in_unit(
             raise error from None
         if found.ambiguous:
             raise
-        if abs(np.log(found.world_from_object.scale)) < UNIT_OFF:
+        if abs(np.log(found.world_from_object.scale)) < SAME_SIZE * METRIC_SCALE_STD:
             return found
         raise RegistrationError(
             "the object was not found in its size, but one of its shape that is "

@@ -20,7 +20,7 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
-from morph_dslam.registration.mesh import MeshRegistration, register_in_unit
+from morph_dslam.registration.mesh import METRIC_SCALE_STD, MeshRegistration, register_in_unit
 from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
@@ -38,9 +38,6 @@ from morph_dslam.tracking.anchoring import points_on_object
 
 #: Keyframes in the picture of a registration.
 N_PICTURES = 3
-#: Standard deviation of what all lengths of a metric map are off by together, a share: no residual of the map shows it.
-#: Data sheets of depth cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
-METRIC_SCALE_STD = 0.01
 
 
 def register(

@@ -443,9 +443,10 @@ class EdgeSearch:
         near = RigidTransform.from_matrix(view.camera_from_world.matrix @ np.linalg.inv(seen.camera_from_world.matrix))
         known = view.camera_from_world.apply(self._dense[0].positions[view.point_ids])[:, 2]
         usual = float(np.median(known)) / max(float(pose.translation[2]), 1e-9) if len(known) else 1.0
-        # In which unit the object lies in which points' way, these say only where it is nearly right.
+        # Points agree on the unit only about where it is right already. In their own view it changes nothing.
+        factors = np.geomspace(1.0 / UNIT_FROM, UNIT_FROM, N_UNITS) if view.frame != seen.frame else np.ones(1)
         best, most = 1.0, 0
-        for begun in usual * np.geomspace(1.0 / UNIT_FROM, UNIT_FROM, N_UNITS):
+        for begun in usual * factors:
             unit, agreeing = float(begun), 0
             for _ in range(3):
                 between = RigidTransform(near.rotation, near.translation / unit)
