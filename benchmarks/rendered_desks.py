@@ -1,13 +1,15 @@
 """Registration of rigid objects on rendered desks, where a larger textured board and clutter stand around them.
 
     python benchmarks/rendered_desks.py [--seeds N] [--first K] [--hints none distance clicks guess] [--again maps]
-                                        [--cache FOLDER] [--make-only] [--pictures]
+                                        [--metric PERCENT] [--cache FOLDER] [--make-only] [--pictures]
 
 A desk (desk_scenes.py) has one of 13 shapes, with few marks on it, or from seed 1000 on a smooth animal of one colour
 (figurines.py), and is filmed in 81 frames of 640x480 pixels by a trembling hand with a rolling shutter; SLAM maps it
 with one camera, so without a scale. The object is then registered as `morph register` does: without a hint, with a
 rough distance (10 to 30 % off), with four points clicked in one frame (1 px off each way), or with a guess in one frame
 (24 px aside, 8 % too near or too far, turned by 8 degrees).
+With ``--metric 1`` the maps are scaled to metres first, each but for an error of its own, of which 1 % is the standard
+deviation, as the maps of a depth camera or a stereo pair are.
 Desks and maps are kept in the cache; ``--again maps`` makes new maps of the recordings.
 
 A registration counts as right where it is unambiguous and, in the first keyframe in which the object is registered,
@@ -21,7 +23,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -36,7 +39,7 @@ import morph_dslam as md
 from desk_scenes import Shape, shape_of, with_sharp_edges, write_desk
 from morph_dslam.extend.geometry import RigidTransform, SimilarityTransform, fit_similarity
 from morph_dslam.extend.registration import Landmarks, draw_registration
-from morph_dslam.extend.slam import run_slam
+from morph_dslam.extend.slam import Trajectory, run_slam
 from morph_dslam.extend.studies import build_rigid
 from morph_dslam.registration.registration import MapRegistration
 from morph_dslam.tracking.anchoring import points_on_object
@@ -166,6 +169,23 @@ def load_desk(seed: int, folder: Path) -> Desk:
     return Desk(seed, shape_of(seed)[1], model, scene, poses, truth["pixels"], truth["visible"], surface, place)
 
 
+def in_metres(desk: Desk, percent: float) -> Desk:
+    """The desk in a metric map, the scale of which is off by so much (one standard deviation)."""
+    off = np.exp(1e-2 * percent * np.random.default_rng([99, desk.seed]).normal())
+    factor = np.array([1.0, 1.0, 1.0, off / desk.place.scale])
+    rigid_map, path = deepcopy(desk.scene.map), desk.scene.trajectory
+    rigid_map.positions = factor[3] * rigid_map.positions
+    rigid_map.baseline_px = 1.0
+    for keyframe in rigid_map.keyframes:
+        keyframe.camera_from_world = keyframe.camera_from_world.copy()
+        keyframe.camera_from_world[:3] *= factor
+    poses = path.world_from_camera.copy()
+    poses[:, :3] *= factor
+    scene = replace(desk.scene, map=rigid_map, trajectory=Trajectory(path.timestamps, poses, path.indices))
+    place = SimilarityTransform(float(off), desk.place.rotation, factor[3] * desk.place.translation)
+    return replace(desk, scene=scene, place=place)
+
+
 def hints_of(desk: Desk, hint: str, folder: Path) -> dict[str, object]:
     """What a user would give, as arguments of `md.register`; files are written to the folder."""
     rng = np.random.default_rng([17, desk.seed])
@@ -231,7 +251,10 @@ def attempt(desk: Desk, hint: str, folder: Path, picture: Path | None) -> Attemp
 
 
 def last_line(attempts: list[list[Attempt]], points: list[int], count: int) -> str:
-    """Of the registrations without a hint; ``hinted`` are those that are right with each of the hints tried."""
+    """Of the registrations without a hint; ``hinted`` are those that are right with each of the hints tried.
+
+    ``place_mm`` is the mean of all places found.
+    """
     plain = [each for desk in attempts for each in desk if each.hint == "none"]
     hinted = []
     for hint in HINTS[1:]:
@@ -241,6 +264,7 @@ def last_line(attempts: list[list[Attempt]], points: list[int], count: int) -> s
                 f"{hint}:{sum(a.is_right for a in tried)}/{len(tried)}(wrong:{sum(a.is_wrong for a in tried)})"
             )
     seconds = [each.seconds for desk in attempts for each in desk]
+    places = [each.place_mm for desk in attempts for each in desk if each.place_mm is not None]
     unaided = "-"
     if plain:
         unaided = (
@@ -248,7 +272,7 @@ def last_line(attempts: list[list[Attempt]], points: list[int], count: int) -> s
             f"ambiguous={sum(each.ambiguous for each in plain)}"
         )
     return (
-        f"right={unaided} hinted={','.join(hinted) or '-'} "
+        f"right={unaided} hinted={','.join(hinted) or '-'} place_mm={np.mean(places) if places else np.nan:.1f} "
         f"seconds={np.median(seconds):.1f} slowest={max(seconds):.1f} points={np.median(points):.0f}"
     )
 
@@ -258,6 +282,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=30, help="how many (%(default)s)")
     parser.add_argument("--first", type=int, default=0, help="the first of them (%(default)s)")
     parser.add_argument("--hints", nargs="+", choices=HINTS, default=["none"], help="to register with (%(default)s)")
+    parser.add_argument(
+        "--metric", type=float, metavar="PERCENT", help="scale the maps to metres, but for such an error"
+    )
     parser.add_argument("--again", choices=["maps"], help="make these anew")
     parser.add_argument("--cache", type=Path, default=CACHE, help="folder of the desks and maps (%(default)s)")
     parser.add_argument("--make-only", action="store_true", help="render and map, register nothing")
@@ -268,6 +295,7 @@ def main() -> int:
     for seed in range(arguments.first, arguments.first + arguments.seeds):
         folder = made(seed, arguments.cache, arguments.again == "maps")
         desk = load_desk(seed, folder)
+        desk = desk if arguments.metric is None else in_metres(desk, arguments.metric)
         points.append(desk.points)
         start = f"seed={seed} shape={shape_of(seed)[0]} keyframes={len(desk.scene.map.keyframes)} points={points[-1]}"
         if arguments.make_only:

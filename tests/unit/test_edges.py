@@ -30,6 +30,19 @@ def apart(found, true):
     return np.linalg.norm((true.inverse @ found).apply(NODES) - NODES, axis=1).max()
 
 
+def scaled(scan, scale):
+    """Points and views of a map in which the object has another scale, and where the object is in it."""
+    points, views = scan
+    ratio = scale / WORLD.scale
+
+    def moved(pose):
+        return RigidTransform(pose.rotation, pose.translation * ratio)
+
+    points = replace(points, positions=points.positions * ratio, viewpoints=points.viewpoints * ratio)
+    views = [replace(view, camera_from_world=moved(view.camera_from_world)) for view in views]
+    return points, views, SimilarityTransform(scale, WORLD.rotation, WORLD.translation * ratio)
+
+
 @pytest.fixture(scope="module")
 def scan():
     """A wedge whose faces have a grey each, before a grey table, with a little noise."""
@@ -52,7 +65,7 @@ def test_edges_lay_an_object_from_near(scan):
     _, views = scan
     off = SimilarityTransform(1.02, Rotation.from_rotvec([0.0, 0.02, 0.01]).as_matrix(), np.array([1e-3, -1e-3, 5e-4]))
     images, edges = EdgeImages(views, CAMERA), MeshEdges(NODES, TRIANGLES)
-    found, covariance = images.refine(edges, WORLD @ off, metric=False)
+    found, covariance = images.refine(edges, WORLD @ off)
     assert apart(found, WORLD) < 1e-3
     assert found.scale == pytest.approx(WORLD.scale, rel=0.01)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
@@ -96,7 +109,7 @@ def test_depth_by_edges_is_unbiased():
         grey = normalize_contrast(image.round().clip(0, 255).astype(np.uint8))
         view = View(0, grey, eye, np.empty(0, np.int64), np.empty((0, 2)))
         start = SimilarityTransform(1.0, turn.as_matrix(), place + rng.normal(0.0, 2e-3, 3))
-        found, _ = EdgeImages([view], DESK_CAMERA).refine(edges, start, metric=True)
+        found, _ = EdgeImages([view], DESK_CAMERA).refine(edges, start, keep_scale=True)
         misses.append((found.translation - place) / place[2])
     assert np.abs(np.mean(misses, axis=0)).max() < 5e-4
 
@@ -112,18 +125,24 @@ def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
     assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
 
 
+@pytest.mark.parametrize("scale", [0.985, 1.015])
+def test_a_metric_maps_error_of_scale_is_not_one_of_distance(scan, scale):
+    points, views, world = scaled(scan, scale)
+    pixels = CAMERA.project(camera_from_object(views[2], world).apply(CORNERS))
+    pixels = pixels + np.random.default_rng(1).normal(0.0, 1.0, pixels.shape)
+    hints = Hints(clicks=(Sighting(views[2].frame, views[2].camera_from_world, CORNERS, pixels),))
+    best = EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, True, hints).search()[0]
+    found, true = (camera_from_object(views[2], place).translation for place in (best.place, world))
+    # Were the scale of the map believed, the object would be off by 1.5 % of its distance.
+    assert abs(found[2] / true[2] - 1.0) < 0.005
+    assert abs(np.log(best.place.scale / scale)) < 2.6 * np.sqrt(best.covariance[0, 0])
+    assert np.sqrt(best.covariance[0, 0]) < 0.01
+
+
 @pytest.mark.parametrize("scale", [0.2, 1.0, 3.7])
 def test_landmarks_in_a_frame_that_is_no_keyframe_place_an_object_in_a_map_of_any_unit(scan, scale):
     """The unit says where the points, which another view sees, lie beside the frame of the landmarks."""
-    points, views = scan
-    ratio = scale / WORLD.scale
-
-    def scaled(pose):
-        return RigidTransform(pose.rotation, pose.translation * ratio)
-
-    world = SimilarityTransform(scale, WORLD.rotation, WORLD.translation * ratio)
-    points = replace(points, positions=points.positions * ratio, viewpoints=points.viewpoints * ratio)
-    views = [replace(view, camera_from_world=scaled(view.camera_from_world)) for view in views]
+    points, views, world = scaled(scan, scale)
     pixels = CAMERA.project(camera_from_object(views[0], world).apply(CORNERS))
     pixels = pixels + np.random.default_rng(1).normal(0.0, 1.0, pixels.shape)
     hints = Hints(clicks=(Sighting(-1, views[0].camera_from_world, CORNERS, pixels),))

@@ -73,9 +73,16 @@ def test_the_similarity_of_the_path_has_the_scale_of_the_map(adjusted):
     # Eight views of a path that is off by 0.6 mm everywhere do not tell its scale any better.
     assert abs(error) < 5e-3
     assert abs(error) < 4.0 * np.sqrt(covariance[0, 0])
-    metric, fixed = similarity_of_path(adjusted, WORLD, nodes.mean(axis=0), metric=True)
-    assert metric.scale == WORLD.scale
-    assert fixed[0, 0] == 0.0
+
+
+def test_what_is_known_of_the_scale_counts_by_its_variance(adjusted):
+    centre = wedge()[0].mean(axis=0)
+    free, of_free = similarity_of_path(adjusted, WORLD, centre)
+    known = np.sqrt(of_free[0, 0])
+    both, of_both = similarity_of_path(adjusted, WORLD, centre, scale_std=known)
+    # The product of two normal distributions of one variance.
+    assert np.log(both.scale) == pytest.approx(0.5 * np.log(free.scale))
+    assert of_both[0, 0] == pytest.approx(0.5 * known**2)
 
 
 def test_an_axis_of_revolution_leaves_its_turn_alone(disturbed):

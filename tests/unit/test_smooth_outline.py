@@ -72,9 +72,8 @@ def test_a_shaded_outline_neither_shrinks_the_object_nor_its_deviation():
         world = SimilarityTransform(1.7, turns[0], rng.normal(size=3))
         views = views_of(world, turns[1], rng)
         points = PointsOnSurface(points_of(views, world, rng), surface, len(views))
-        found, covariance = EdgeImages(views, CAMERA).refine(edges, world, metric=False, points=points)
-        # What the outlines are off is the same in all keyframes.
-        deviation = np.sqrt(len(views) * covariance[0, 0])
+        found, covariance = EdgeImages(views, CAMERA).refine(edges, world, points=points)
+        deviation = np.sqrt(covariance[0, 0])
         misses.append(np.log(found.scale / world.scale) / deviation)
         there, true = (camera_from_object(views[3], place).translation for place in (found, world))
         away.append(np.linalg.norm(there - true))

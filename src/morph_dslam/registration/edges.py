@@ -268,10 +268,11 @@ class EdgeImages:
         self,
         edges: MeshEdges,
         start: SimilarityTransform,
-        metric: bool,
+        keep_scale: bool = False,
         reaches: Sequence[float] = REACHES,
         clicks: Sequence[Sighting] = (),
         points: PointsOnSurface | None = None,
+        scale_std: float = np.inf,
     ) -> tuple[SimilarityTransform, Array]:
         """The place near ``start`` that has its edges on those of the images.
 
@@ -279,20 +280,22 @@ class EdgeImages:
         ----------
         edges : of the object.
         start : metres to the map's unit.
-        metric : keep the scale.
+        keep_scale : whether the scale stays as it is.
         reaches : pixels to search, in turn.
         clicks : landmarks, which keep the place near to where they were set.
         points : of the map, which are to lie on the object.
+        scale_std : standard deviation of the logarithm of the scale about 1, as of a metric map.
 
         Returns
         -------
-        The place, and the covariance (7, 7) of log scale, rotation vector and translation about the mean node.
+        The place, and the covariance (7, 7) of log scale, rotation vector and translation about the mean node. What
+        the mesh's edges and the image's are off is taken for the same in all views.
         """
         centre, place = edges.nodes.mean(axis=0), start
         units = np.array([1.0] * 4 + [edges.size * start.scale] * 3)
-        free = slice(1 if metric else 0, None)
+        free = slice(1 if keep_scale else 0, None)
         near = None if points is None else points.near(start)
-        covariance = np.zeros((7, 7))
+        covariance, known = np.zeros((7, 7)), np.diag([scale_std**-2, *[0.0] * 6])
         for reach in reaches:
             matrix, right = self._equations(edges, place, reach, centre)
             for click in clicks:
@@ -300,13 +303,14 @@ class EdgeImages:
             if near is not None:
                 of_points = near.equations(place, centre, reach)
                 matrix, right = matrix + of_points[0], right + of_points[1]
-            matrix, right = matrix * np.outer(units, units), right * units
+            right = right * units - known[0] * np.log(place.scale)
             # What the edges leave open stays.
-            damped = matrix[free, free] + np.diag(1e-4 * np.diag(matrix[free, free]) + 1e-6)
+            matrix = matrix * np.outer(units, units)
+            matrix += np.diag(1e-4 * np.diag(matrix) + 1e-6)
             step = np.zeros(7)
-            step[free] = np.clip(np.linalg.solve(damped, right[free]), -0.15, 0.15)
+            step[free] = np.clip(np.linalg.solve((matrix + known)[free, free], right[free]), -0.15, 0.15)
             covariance = np.zeros((7, 7))
-            covariance[free, free] = np.linalg.inv(damped)
+            covariance[free, free] = np.linalg.inv((matrix / max(1, len(self.views)) + known)[free, free])
             place = moved_similarity(place, step * units, centre)
         return place, covariance * np.outer(units, units)
 

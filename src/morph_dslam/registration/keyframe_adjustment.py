@@ -41,6 +41,8 @@ ACROSS_PATCHES = 9.0 / 4.0
 IN_COMMON = 16.0 / 9.0
 #: At most so many points, those that most views saw.
 MOST_STATIC = 2000
+#: Corners of images are no more exact, pixels.
+LEAST_STATIC_PX = 0.1
 #: Iterations for the points' places, and how far a point's block is from singular at the least.
 POINT_ITERATIONS, RIDGE = 3, 1e-6
 #: Points nearer than this part of the usual depth do not count.
@@ -153,7 +155,7 @@ class _StaticPoints:
             self._positions = self._positions + np.linalg.solve(blocks, right[:, :, None])[:, :, 0]
         residuals, by_point, by_pose = self._residuals(poses)
         weights, sigma = self._weights(residuals)
-        weights = weights / sigma**2
+        weights = weights / max(sigma, LEAST_STATIC_PX) ** 2
         blocks, right = self._point_system(residuals, by_point, weights)
         n, k = len(self), len(poses)
         weighted = by_pose * weights[:, None, None]
@@ -355,7 +357,7 @@ PATH_ITERATIONS = 5
 
 
 def similarity_of_path(
-    adjusted: AdjustedKeyframes, start: SimilarityTransform, centre: Array, metric: bool = False
+    adjusted: AdjustedKeyframes, start: SimilarityTransform, centre: Array, scale_std: float = np.inf
 ) -> tuple[SimilarityTransform, Array]:
     """The world_from_object that brings the map's keyframes nearest to the adjusted ones.
 
@@ -367,7 +369,7 @@ def similarity_of_path(
     adjusted : the keyframes about the object.
     start : near the similarity.
     centre : (3,) the mean node, object frame, metres.
-    metric : keep the scale.
+    scale_std : standard deviation of the logarithm of the scale about 1, as of a metric map.
 
     Returns
     -------
@@ -375,9 +377,8 @@ def similarity_of_path(
     world. It holds that of the adjusted poses, what the fit makes of the path's own errors, and these errors
     as they are in a single keyframe: a camera that is found in the map has them.
     """
-    transform, free = start, slice(1 if metric else 0, 7)
-    size, count = start.scale, len(adjusted.poses)
-    units = np.array([1.0] * 4 + [size] * 3)[free]
+    transform, size, count = start, start.scale, len(adjusted.poses)
+    units = np.array([1.0] * 4 + [size] * 3)
     covariance = np.zeros((7, 7))
     for _ in range(PATH_ITERATIONS):
         metrics, rows, misses = [], [], []
@@ -385,20 +386,22 @@ def similarity_of_path(
             placed = camera_from_object(view, transform)
             metric_of_view = _metric(placed, centre)
             metrics.append(metric_of_view)
-            rows.append(metric_of_view @ similarity_jacobian(placed, transform, centre)[:, free] * units)
+            rows.append(metric_of_view @ similarity_jacobian(placed, transform, centre) * units)
             turn = rotation_log(pose.rotation @ placed.rotation.T)
             misses.append(metric_of_view @ np.concatenate([turn, pose.translation - placed.translation]))
         stacked = np.concatenate(rows)
         inverse = np.linalg.pinv(stacked.T @ stacked, rcond=1e-12, hermitian=True)
         solution = inverse @ stacked.T @ np.concatenate(misses)
-        step = np.zeros(7)
-        step[free] = solution * units
         left = np.concatenate(misses) - stacked @ solution
         gradients = np.einsum("kij,ki->kj", stacked.reshape(count, 6, -1), left.reshape(count, 6))
         gain = np.concatenate([row.T @ m for row, m in zip(rows, metrics, strict=True)], axis=1)
         meat = gradients.T @ gradients + gain @ adjusted.covariance @ gain.T
-        covariance[free, free] = inverse @ meat @ inverse * np.outer(units, units)
-        transform = moved_similarity(transform, step, centre)
+        covariance = inverse @ meat @ inverse * np.outer(units, units)
+        transform = moved_similarity(transform, solution * units, centre)
+    if np.isfinite(scale_std):
+        gained = covariance[0] / (covariance[0, 0] + scale_std**2)
+        transform = moved_similarity(transform, -np.log(transform.scale) * gained, centre)
+        covariance = covariance - np.outer(gained, covariance[0])
     covariance[1:, 1:] += _scatter(adjusted, transform, centre)
     return transform, covariance
 

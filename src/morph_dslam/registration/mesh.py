@@ -35,7 +35,7 @@ from morph_dslam.registration.messages import (
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.registration import Axis, Rival
-from morph_dslam.registration.scene import MapPoints, View, spread_views
+from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, scale_std_of, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.surface_search import laid
 from morph_dslam.registration.texture import Agreement, TextureComparison
@@ -80,9 +80,6 @@ SURE = 20.0
 #: Images on the object that show its shape are believed before its edges, unless they lose more than this of the score;
 #: and always where the adjusted keyframes agree on them to so many pixels, as they do if nothing is off but noise.
 LOST, EXACT_PX = 5.0, 0.05
-#: Standard deviation of what all lengths of a metric map are off by together, a share: no residual of the map shows it.
-#: Data sheets of depth cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
-METRIC_SCALE_STD = 0.01
 #: An object of another size than its mesh's by less than so many of these is the same one.
 SAME_SIZE = 3.0
 #: The edges speak against a place found by points below this.
@@ -259,7 +256,7 @@ def _by_edges(
         unconfirmed=not by_clicks and score < CONFIRMED,
         edges=best.edges,
     )
-    aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, metric)
+    aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, scale_std_of(metric))
     if aligned is None or aligned.rms_px > POOR_AGREEMENT_PX:
         return found
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
@@ -302,7 +299,9 @@ def _by_points(
             places.append(judged(_refined(start.transform, points, surface, metric), more))
     candidates = _distinct(places, len(points), surface)
     comparison = TextureComparison(nodes, triangles, camera)
-    aligned = [comparison.refine(place.transform, views, metric) for place in _worth_comparing(candidates)]
+    aligned = [
+        comparison.refine(place.transform, views, scale_std_of(metric)) for place in _worth_comparing(candidates)
+    ]
     found = _chosen(candidates, aligned, surface)
     if found.rms_px is not None:
         adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
@@ -324,7 +323,8 @@ def _adjusted(
     keyframes = adjustment.adjust(found.world_from_object)
     if keyframes is None:
         return found
-    placed, covariance = similarity_of_path(keyframes, found.world_from_object, mean_node, metric)
+    start = found.world_from_object
+    placed, covariance = similarity_of_path(keyframes, start, mean_node, scale_std_of(metric))
     return replace(found, world_from_object=placed, covariance=covariance, keyframes=keyframes)
 
 

@@ -20,7 +20,7 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
-from morph_dslam.registration.mesh import METRIC_SCALE_STD, MeshRegistration, register_in_unit
+from morph_dslam.registration.mesh import MeshRegistration, register_in_unit
 from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
@@ -93,10 +93,7 @@ def register(
         "map_units_per_metre": found.world_from_object.scale,
         "outline_share": _outline_share(found),
     }
-    covariance = found.covariance
-    if covariance is not None and scene.is_metric:
-        covariance = covariance + np.diag([METRIC_SCALE_STD**2, *[0.0] * 6])
-    in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), covariance)
+    in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
     placed = registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis, scene)
     return replace(placed, rivals=found.rivals)
 

@@ -122,14 +122,14 @@ class TextureComparison:
         self._nodes, self._triangles, self._camera = nodes, triangles, camera
         self._centre = nodes.mean(axis=0)
 
-    def refine(self, start: SimilarityTransform, views: Sequence[View], metric: bool = False) -> Agreement | None:
+    def refine(self, start: SimilarityTransform, views: Sequence[View], scale_std: float = np.inf) -> Agreement | None:
         """The world_from_object near ``start`` with which all views agree.
 
         Parameters
         ----------
         start : metres to the map's unit.
         views : keyframes of the map.
-        metric : keep the scale.
+        scale_std : standard deviation of the logarithm of the scale about 1, as of a metric map.
 
         Returns
         -------
@@ -142,7 +142,7 @@ class TextureComparison:
             measured = self.measure(images, poses)
             if sum(len(pair.offsets) for pair in measured) < FEWEST:
                 return None
-            step, rms = self._step(measured, poses, transform, metric)
+            step, rms = self._step(measured, poses, transform, scale_std)
             transform = moved_similarity(transform, step, self._centre)
         share = sum(len(pair.offsets) for pair in measured) / sum(pair.n_compared for pair in measured)
         return Agreement(transform, rms, share, _relief(measured))
@@ -152,7 +152,7 @@ class TextureComparison:
         measured: list[PairDisplacements],
         poses: list[RigidTransform],
         transform: SimilarityTransform,
-        metric: bool,
+        scale_std: float,
     ) -> tuple[Array, float]:
         """The step (7,) of the similarity, and the root mean square misfit in pixels."""
         slopes = [similarity_jacobian(pose, transform, self._centre) for pose in poses]
@@ -162,17 +162,20 @@ class TextureComparison:
         offsets = np.concatenate([pair.offsets for pair in measured])
         # Unknowns in comparable units, of which those that the images leave open stay as they are.
         size = transform.scale * float(np.sqrt(np.mean(np.sum((self._nodes - self._centre) ** 2, axis=1))))
-        units, free = np.array([1.0 / size] * 4 + [1.0] * 3), slice(1 if metric else 0, 7)
+        units = np.array([1.0 / size] * 4 + [1.0] * 3)
         rows = rows * units
-        step, misfit, weights = np.zeros(7), offsets, np.ones(len(rows))
+        step, misfit, mean_square = np.zeros(7), offsets, 0.0
         for _ in range(10):
             weights = HUBER_PX / np.maximum(np.linalg.norm(misfit, axis=1), HUBER_PX)
+            mean_square = float(np.average(np.mean(misfit**2, axis=1), weights=weights))
+            # All pairs of views that show a point share what it is off.
+            known = len(poses) * mean_square * (units[0] / scale_std) ** 2
             matrix = np.einsum("pij,p,pik->jk", rows, weights, rows, optimize=True)
             right = np.einsum("pij,p,pi->j", rows, weights, offsets, optimize=True)
-            inverse = np.linalg.pinv(matrix[free, free], rcond=1e-5, hermitian=True)
-            step[free] = inverse @ right[free]
+            matrix[0, 0] += known
+            right[0] -= known * np.log(transform.scale) / units[0]
+            step = np.linalg.pinv(matrix, rcond=1e-5, hermitian=True) @ right
             misfit = offsets - rows @ step
-        mean_square = np.average(np.mean(misfit**2, axis=1), weights=weights)
         return step * units, float(np.sqrt(mean_square))
 
     def measure(self, images: Sequence[Image], poses: Sequence[RigidTransform]) -> list[PairDisplacements]:

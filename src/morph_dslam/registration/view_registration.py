@@ -25,7 +25,7 @@ from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
-from morph_dslam.registration.scene import MapPoints, View, camera_from_object, spread_views, views_of
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object, scale_std_of, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
 from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
 from morph_dslam.threads import on_all_cores
@@ -169,6 +169,7 @@ class EdgeSearch:
         self.edges, self.surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
         self._points, self._views, self.camera, self._metric = points, list(views), camera, metric
         self._hints, self._claimed = hints, claimed
+        self._scale_std = scale_std_of(metric)
 
     def search(self) -> list[EdgeRegistration]:
         """Distinct places, the best first; none where nothing resembles the object.
@@ -200,7 +201,7 @@ class EdgeSearch:
         few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
 
         def rough(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
-            place = few.refine(self.edges, start, self._metric, ROUGH, self._hints.clicks, self._on_it)[0]
+            place = few.refine(self.edges, start, False, ROUGH, self._hints.clicks, self._on_it, self._scale_std)[0]
             return _rank(few.evidence(self.edges, place), self.points_at(place, FEW_VIEWS)), place
 
         chosen: list[SimilarityTransform] = []
@@ -241,13 +242,11 @@ class EdgeSearch:
         more exact.
         """
         clicks, edges = self._hints.clicks, self.edges
-        by_both = images.refine(edges, start, self._metric, reaches, clicks, self._on_it)
-        by_edges = images.refine(edges, start, self._metric, [*reaches, *NEAREST], clicks)
+        by_both = images.refine(edges, start, False, reaches, clicks, self._on_it, self._scale_std)
+        by_edges = images.refine(edges, start, False, [*reaches, *NEAREST], clicks, None, self._scale_std)
         in_size = images.refine(edges, by_both[0], True, NEAREST, clicks)[0]
-        # What the mesh's edges are off is the same in all keyframes.
-        count = max(1, len(images.views))
         fits = [
-            EdgeRegistration(place, covariance * count, images.evidence(edges, place), self.points_at(place))
+            EdgeRegistration(place, covariance, images.evidence(edges, place), self.points_at(place))
             for place, covariance in (by_edges, (in_size, by_both[1]))
         ]
         return max(fits, key=lambda each: each.rank)
@@ -276,8 +275,10 @@ class EdgeSearch:
         seen, images = found.points, self._images(found.place)
         rows = np.flatnonzero(seen.explained | seen.occluded | seen.hidden_by)
         on_it = PointsOnSurface(self._dense[0][rows], self.surface, len(self._dense[1]))
-        place, covariance = images.refine(self.edges, found.place, self._metric, NEAREST, self._hints.clicks, on_it)
-        sized = replace(self.at(place), covariance=covariance * max(1, len(images.views)))
+        place, covariance = images.refine(
+            self.edges, found.place, False, NEAREST, self._hints.clicks, on_it, self._scale_std
+        )
+        sized = replace(self.at(place), covariance=covariance)
         apart = abs(np.log(place.scale / found.place.scale))
         agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > MUCH_WORSE * found.rank
         return sized if agree else found
