@@ -246,8 +246,8 @@ BENCHMARKS = {
         "python benchmarks/rendered_desks.py --metric 1 --hints clicks",
         "simulated: exact pose; right is within 5 mm and 3 degrees",
         "scales of the maps off by 1 % (one standard deviation), clicks of 1 px, a trembling hand, a rolling shutter",
-        about="Maps as of a depth camera or a stereo pair. Of two ways to count what is known of the scale, about equally "
-        "good, one was chosen with these desks in sight.",
+        about="Maps as of a depth camera or a stereo pair. Of two ways to count what is known of the scale, about "
+        "equally good, one was chosen with these desks in sight.",
     ),
     "figurines": Benchmark(
         "Registration",
