@@ -315,8 +315,8 @@ BENCHMARKS = {
         lines=21,
         about="`measured points` is the model fitted to the measured points of the seen half, without images: what the "
         "model itself knows of the other half. Nothing holds the bicubic sheet where no frame shows it, and it runs "
-        "away. `worst_of_today` is against errors of 17.6, 27.1, 7.8 and 7.1 mm of an earlier release, in pictures that "
-        "were painted otherwise.",
+        "away. `worst_of_today` is against errors of 17.6, 27.1, 7.8 and 7.1 mm of an earlier release, in pictures "
+        "that were painted otherwise.",
     ),
     "unknown_loads": Benchmark(
         "Mechanics",
