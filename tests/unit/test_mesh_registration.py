@@ -12,7 +12,7 @@ from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.meshing.generators import tube
 from morph_dslam.registration.icp import Surface, fit_surface
 from morph_dslam.registration.mesh import register_in_unit, register_mesh
-from morph_dslam.registration.messages import Ambiguity, Ambiguous, OutlineElsewhere, TooLittleTexture
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, OtherSize, OutlineElsewhere, TooLittleTexture
 from morph_dslam.registration.register import register
 from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints, View
@@ -93,7 +93,7 @@ def test_images_show_the_shape_of_an_arch_and_none_of_a_plate(height):
     assert found.relief_px == pytest.approx(0.0 if height == 0.0 else 3.0, abs=1e-6 if height == 0.0 else 2.0)
 
 
-@pytest.mark.parametrize("off", [0.0, 0.015])
+@pytest.mark.parametrize("off", [0.0, 0.015, 0.045])
 def test_an_error_of_a_metric_maps_scale_does_not_move_the_object(off):
     world = SimilarityTransform(1.0 + off, METRIC.rotation, METRIC.translation)
     points, views = scanned(world, with_images=True)
@@ -106,13 +106,15 @@ def test_an_error_of_a_metric_maps_scale_does_not_move_the_object(off):
         rigid_map.add_keyframe(Keyframe(view.frame, 0.0, view.normalized, pose, view.point_ids, view.pixels))
     model = bending_wedge()
     found = register(Scene(CAMERA, rigid_map, Trajectory(np.zeros(0), np.zeros((0, 4, 4)))), model)
-    assert found.warnings == ()
+    scale = found.map_registration.world_from_object.scale
+    # Three standard deviations.
+    assert found.warnings == ((OtherSize(scale),) if off > 0.03 else ())
     assert [view.frame for view in found.keyframes] == [view.frame for view in views]
     assert len(found.views) == len(views)
-    assert found.map_registration.world_from_object.scale == pytest.approx(1.0 + off, abs=0.005)
-    # Were the scale of the map believed, it would be 4.8 mm away.
+    assert scale == pytest.approx(1.0 + off, abs=0.007)
+    # Were the scale of the map believed, it would be 4.8 mm away with an error of 1.5 %.
     misses = found.state.camera_from_object.apply(model.nodes) - cameras()[-1].apply(model.nodes)
-    assert np.linalg.norm(misses, axis=1).max() < 2e-3
+    assert np.linalg.norm(misses, axis=1).max() < 2.5e-3
     ahead = cameras()[-1].apply(model.nodes).mean(axis=0)
     towards = np.concatenate([np.zeros(3), ahead / np.linalg.norm(ahead)])
     spread = found.map_registration.pose_covariance(cameras()[-1])

@@ -414,6 +414,11 @@ def _chosen(candidates: list[_Place], aligned: list[Agreement | None], surface: 
     )
 
 
+def same_size(scale: float) -> bool:
+    """Whether an object of this scale in a metric map may have its mesh's size."""
+    return bool(abs(np.log(scale)) < SAME_SIZE * METRIC_SCALE_STD)
+
+
 def register_in_unit(
     nodes: Array,
     triangles: NDArray[np.int64],
@@ -440,7 +445,7 @@ def register_in_unit(
             raise error from None
         if found.ambiguous:
             raise
-        if abs(np.log(found.world_from_object.scale)) < SAME_SIZE * METRIC_SCALE_STD:
+        if same_size(found.world_from_object.scale):
             return found
         raise RegistrationError(
             "the object was not found in its size, but one of its shape that is "

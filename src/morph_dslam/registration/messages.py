@@ -130,6 +130,22 @@ class UnusualSize(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class OtherSize(RegistrationWarning):
+    """The object has another size in a metric map than its mesh.
+
+    Attributes
+    ----------
+    ratio : of its size there to that of the mesh.
+    """
+
+    template: ClassVar[str] = (
+        "registration doubtful: in the map, which is metric, the object is {ratio:.3f} times as large as its mesh; "
+        "check the mesh's dimensions, and the calibration of the depth camera or the stereo pair"
+    )
+    ratio: float
+
+
+@dataclass(frozen=True)
 class WrongUnit(RegistrationWarning):
     """The landmarks lie on a part of the object, and would lie all over it in another unit.
 

@@ -20,7 +20,8 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
-from morph_dslam.registration.mesh import MeshRegistration, register_in_unit
+from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
+from morph_dslam.registration.messages import OtherSize
 from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
@@ -94,7 +95,10 @@ def register(
         "outline_share": _outline_share(found),
     }
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
-    placed = registration_in_map(model, in_map, _keyframes(found, views), facts, found.warnings, found.axis, scene)
+    warnings = found.warnings
+    if scene.is_metric and not same_size(found.world_from_object.scale):
+        warnings += (OtherSize(found.world_from_object.scale),)
+    placed = registration_in_map(model, in_map, _keyframes(found, views), facts, warnings, found.axis, scene)
     return replace(placed, rivals=found.rivals)
 
 
