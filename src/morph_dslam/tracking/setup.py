@@ -36,7 +36,7 @@ class TrackedObject:
     Attributes
     ----------
     name : by which messages and results call it; its run folder.
-    model : as it is in its file.
+    model : of its file, with the angle that its registration leaves open, if any.
     start : its registration in a map, or landmarks or an initializer that give it in the reference frame.
     options : what is measured, and what earlier frames add.
     inner : structures inside of it.
@@ -141,7 +141,10 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
         registration = in_scene(registration, scene_of(path))
     # A free object is not where the map has it, but looks as in the map's keyframes.
     keyframes = registered_keyframes(registration)
-    return TrackedObject(name, model, registration, options, inner, keyframes, again, click_px=run.click_px)
+    # Not the model of the file: beside a copy with an open angle it would be kept for nothing.
+    return TrackedObject(
+        name, registration.model, registration, options, inner, keyframes, again, click_px=run.click_px
+    )
 
 
 def map_of(registration: Path, given: Path | None) -> Path | None:
