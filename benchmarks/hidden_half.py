@@ -107,30 +107,33 @@ def paint(data: Path, whole: Path, half: str, folder: Path) -> None:
         cv2.imwrite(str(folder / f"{frame:03d}.png"), picture)
 
 
+def on_half(flat: np.ndarray, half: str) -> np.ndarray:
+    """Which points of the flat sheet (p, 3) are on a half."""
+    axis, sign = HALVES[half]
+    return sign * flat[:, axis] > 0.0
+
+
 def hidden_error(data: Path, run_folder: Path, half: str) -> tuple[float, int]:
     """Mean error, mm, of the measured points on the hidden half, and frames that were not tracked."""
-    run, (axis, sign) = md.load_run(run_folder), HALVES[half]
-    truth = load_truth(data / "ground_truth.npz")
+    run, truth = md.load_run(run_folder), load_truth(data / "ground_truth.npz")
     error = material_error(run, truth, int(truth.frames[truth.frames >= FIRST].min()))
-    flat = run.model.rest_positions(error.binding.points)
-    hidden = sign * flat[:, axis] > 0.0
+    hidden = on_half(run.model.rest_positions(error.binding.points), half)
     return 1e3 * float(np.nanmean(error.distances[:, hidden])), int((~run.tracked).sum())
 
 
 def fitted_error(data: Path, whole: Path, half: str) -> float:
     """Mean error, mm, of the hidden half where the model is fitted to the measured points of the other one."""
-    run, (axis, sign) = md.load_run(whole), HALVES[half]
-    truth = load_truth(data / "ground_truth.npz")
-    binding = material_error(run, truth, int(truth.frames[truth.frames >= FIRST].min())).binding
-    model, points = run.model, binding.points
-    hidden = sign * model.rest_positions(points)[:, axis] > 0.0
+    run, truth = md.load_run(whole), load_truth(data / "ground_truth.npz")
+    model, binding = run.model, material_error(run, truth, int(truth.frames[truth.frames >= FIRST].min())).binding
+    rest, displacement = model.rest_positions(binding.points), model.restrict(binding.points)
+    hidden = on_half(rest, half)
     size, errors = model.upper - model.lower, []
 
     def placed(unknowns: np.ndarray) -> np.ndarray:
-        nodes = model.positions(np.clip(model.lower + unknowns[6:] * size, model.lower, model.upper))
-        on_sheet = np.einsum("pc,pcx->px", points.weights, nodes[model.triangles[points.triangles]])
+        on_sheet = rest + displacement.value(np.clip(model.lower + unknowns[6:] * size, model.lower, model.upper))
         return Rotation.from_rotvec(unknowns[:3]).apply(on_sheet) + unknowns[3:6]
 
+    x_scale = np.r_[np.full(3, 0.1), np.full(3, 0.05), np.full(len(size), 0.1)]
     bounds = np.r_[np.full(6, -np.inf), np.zeros(len(size))], np.r_[np.full(6, np.inf), np.ones(len(size))]
     for frame in truth.frames[truth.frames >= FIRST].tolist():
         measured = truth.points[truth.frames == frame][0][binding.columns]
@@ -142,9 +145,7 @@ def fitted_error(data: Path, whole: Path, half: str) -> float:
         def miss(unknowns: np.ndarray, measured: np.ndarray = measured) -> np.ndarray:
             return 1e3 * (placed(unknowns) - measured)[~hidden].ravel()
 
-        found = least_squares(
-            miss, start, bounds=bounds, x_scale=np.r_[np.full(3, 0.1), np.full(3, 0.05), 0.1 + 0 * size]
-        )
+        found = least_squares(miss, start, bounds=bounds, x_scale=x_scale)
         errors.append(1e3 * np.linalg.norm(placed(found.x) - measured, axis=1)[hidden])
     return float(np.nanmean(errors))
 

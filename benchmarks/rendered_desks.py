@@ -177,7 +177,6 @@ def in_metres(desk: Desk, percent: float) -> Desk:
     rigid_map.positions = factor[3] * rigid_map.positions
     rigid_map.baseline_px = 1.0
     for keyframe in rigid_map.keyframes:
-        keyframe.camera_from_world = keyframe.camera_from_world.copy()
         keyframe.camera_from_world[:3] *= factor
     poses = path.world_from_camera.copy()
     poses[:, :3] *= factor

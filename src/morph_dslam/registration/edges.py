@@ -252,10 +252,11 @@ class EdgeImages:
     ----------
     views : keyframes.
     camera : of the views, without distortion.
+    scale_std : standard deviation of the logarithm of the map's scale about 1; infinite where its unit is unknown.
     """
 
-    def __init__(self, views: Sequence[View], camera: Camera) -> None:
-        self.views, self.camera = list(views), camera
+    def __init__(self, views: Sequence[View], camera: Camera, scale_std: float = np.inf) -> None:
+        self.views, self.camera, self._scale_std = list(views), camera, scale_std
 
     @cached_property
     def slopes(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
@@ -268,11 +269,10 @@ class EdgeImages:
         self,
         edges: MeshEdges,
         start: SimilarityTransform,
-        keep_scale: bool = False,
         reaches: Sequence[float] = REACHES,
         clicks: Sequence[Sighting] = (),
         points: PointsOnSurface | None = None,
-        scale_std: float = np.inf,
+        keep_scale: bool = False,
     ) -> tuple[SimilarityTransform, Array]:
         """The place near ``start`` that has its edges on those of the images.
 
@@ -280,11 +280,10 @@ class EdgeImages:
         ----------
         edges : of the object.
         start : metres to the map's unit.
-        keep_scale : whether the scale stays as it is.
         reaches : pixels to search, in turn.
         clicks : landmarks, which keep the place near to where they were set.
         points : of the map, which are to lie on the object.
-        scale_std : standard deviation of the logarithm of the scale about 1, as of a metric map.
+        keep_scale : whether the scale stays as it is.
 
         Returns
         -------
@@ -295,7 +294,7 @@ class EdgeImages:
         units = np.array([1.0] * 4 + [edges.size * start.scale] * 3)
         free = slice(1 if keep_scale else 0, None)
         near = None if points is None else points.near(start)
-        covariance, known = np.zeros((7, 7)), np.diag([scale_std**-2, *[0.0] * 6])
+        covariance, known = np.zeros((7, 7)), np.diag([self._scale_std**-2, *[0.0] * 6])
         for reach in reaches:
             matrix, right = self._equations(edges, place, reach, centre)
             for click in clicks:

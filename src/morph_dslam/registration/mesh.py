@@ -35,7 +35,7 @@ from morph_dslam.registration.messages import (
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.registration import Axis, Rival
-from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, scale_std_of, spread_views
+from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, spread_views
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.surface_search import laid
 from morph_dslam.registration.texture import Agreement, TextureComparison
@@ -205,14 +205,14 @@ def register_mesh(
                 "give three landmarks",
                 RegistrationFailure.NOT_FOUND,
             )
-        return _by_edges(places, search, points, views, metric, bool(hints.clicks))
+        return _by_edges(places, search, points, views, bool(hints.clicks))
     score = 100.0 * places[0].rank if places else 0.0
-    by_edges = cache(partial(_by_edges, places, search, points, views, metric))
+    by_edges = cache(partial(_by_edges, places, search, points, views))
     is_clear = score >= CONFIRMED and _clear([place.rank for place in places])
     if is_clear and (score >= SURE or by_edges().rms_px is not None):
         return by_edges()
     try:
-        found = _by_points(search, points, views, metric, progress)
+        found = _by_points(search, points, views, progress)
     except RegistrationError:
         if score < CONFIRMED:
             raise
@@ -237,7 +237,6 @@ def _by_edges(
     search: EdgeSearch,
     points: MapPoints,
     views: Sequence[View],
-    metric: bool,
     by_clicks: bool = False,
 ) -> MeshRegistration:
     """The best of the places, refined by the images on it where its edges stay; the others are its rivals."""
@@ -256,7 +255,7 @@ def _by_edges(
         unconfirmed=not by_clicks and score < CONFIRMED,
         edges=best.edges,
     )
-    aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, scale_std_of(metric))
+    aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, search.scale_std)
     if aligned is None or aligned.rms_px > POOR_AGREEMENT_PX:
         return found
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
@@ -264,7 +263,7 @@ def _by_edges(
         replace(found, world_from_object=aligned.place, rms_px=aligned.rms_px, shape_shown=aligned.shows_its_shape),
         adjustment,
         nodes.mean(axis=0),
-        metric,
+        search.scale_std,
     )
     there, keyframes = search.at(adjusted.world_from_object), adjusted.keyframes
     is_exact = keyframes is not None and keyframes.rms_px <= EXACT_PX
@@ -276,9 +275,7 @@ def _by_edges(
     return replace(adjusted, edges=there.edges, outline=outline)
 
 
-def _by_points(
-    search: EdgeSearch, points: MapPoints, views: Sequence[View], metric: bool, progress: bool
-) -> MeshRegistration:
+def _by_points(search: EdgeSearch, points: MapPoints, views: Sequence[View], progress: bool) -> MeshRegistration:
     """The object found by the points of the map alone; parameters as of `register_mesh`."""
     surface, nodes, triangles, camera = search.surface, search.edges.nodes, search.edges.triangles, search.camera
     rougher, rough = (Surface.of_mesh(nodes, triangles, count) for count in ROUGH_SAMPLES)
@@ -294,18 +291,16 @@ def _by_points(
     for region in tqdm(
         candidate_regions(points.positions, planes), desc="registering", unit="region", disable=not progress
     ):
-        starts = [judged(place, few) for place in _searched(points[region], rougher, rough, starts_in, metric)]
+        starts = [judged(place, few) for place in _searched(points[region], rougher, rough, starts_in, search.metric)]
         for start in sorted(starts, key=lambda place: -place.evidence.score)[:N_REFINED]:
-            places.append(judged(_refined(start.transform, points, surface, metric), more))
+            places.append(judged(_refined(start.transform, points, surface, search.metric), more))
     candidates = _distinct(places, len(points), surface)
     comparison = TextureComparison(nodes, triangles, camera)
-    aligned = [
-        comparison.refine(place.transform, views, scale_std_of(metric)) for place in _worth_comparing(candidates)
-    ]
+    aligned = [comparison.refine(place.transform, views, search.scale_std) for place in _worth_comparing(candidates)]
     found = _chosen(candidates, aligned, surface)
     if found.rms_px is not None:
         adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
-        found = _adjusted(found, adjustment, nodes.mean(axis=0), metric)
+        found = _adjusted(found, adjustment, nodes.mean(axis=0), search.scale_std)
     outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
     unconfirmed = found.rms_px is None and any(np.ptp(view.normalized) > 0 for view in views)
     return replace(found, outline=outline, unconfirmed=unconfirmed)
@@ -317,14 +312,13 @@ def _best_rivals(others: list[Rival]) -> tuple[Rival, ...]:
 
 
 def _adjusted(
-    found: MeshRegistration, adjustment: KeyframeAdjustment, mean_node: Array, metric: bool
+    found: MeshRegistration, adjustment: KeyframeAdjustment, mean_node: Array, scale_std: float
 ) -> MeshRegistration:
     """The registration with keyframes placed about the object, where there is enough to compare."""
     keyframes = adjustment.adjust(found.world_from_object)
     if keyframes is None:
         return found
-    start = found.world_from_object
-    placed, covariance = similarity_of_path(keyframes, start, mean_node, scale_std_of(metric))
+    placed, covariance = similarity_of_path(keyframes, found.world_from_object, mean_node, scale_std)
     return replace(found, world_from_object=placed, covariance=covariance, keyframes=keyframes)
 
 

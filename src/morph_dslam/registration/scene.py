@@ -22,11 +22,6 @@ SEEN_SHARE = 0.5
 METRIC_SCALE_STD = 0.01
 
 
-def scale_std_of(metric: bool) -> float:
-    """Standard deviation of the logarithm of a map's scale about 1; infinite where its unit is not the metre."""
-    return METRIC_SCALE_STD if metric else np.inf
-
-
 @dataclass(frozen=True)
 class MapPoints:
     """Points (n, 3) of a map, and from where (n, 3) each was seen, world."""

@@ -25,7 +25,7 @@ from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
-from morph_dslam.registration.scene import MapPoints, View, camera_from_object, scale_std_of, spread_views, views_of
+from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
 from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
 from morph_dslam.threads import on_all_cores
@@ -167,9 +167,9 @@ class EdgeSearch:
         claimed: Claimed | None = None,
     ) -> None:
         self.edges, self.surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
-        self._points, self._views, self.camera, self._metric = points, list(views), camera, metric
+        self._points, self._views, self.camera, self.metric = points, list(views), camera, metric
         self._hints, self._claimed = hints, claimed
-        self._scale_std = scale_std_of(metric)
+        self.scale_std = METRIC_SCALE_STD if metric else np.inf
 
     def search(self) -> list[EdgeRegistration]:
         """Distinct places, the best first; none where nothing resembles the object.
@@ -198,10 +198,10 @@ class EdgeSearch:
 
     def _fitted_from(self, starts: Sequence[SimilarityTransform]) -> list[EdgeRegistration]:
         """Distinct places near some others, the best first."""
-        few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera)
+        few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera, self.scale_std)
 
         def rough(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
-            place = few.refine(self.edges, start, False, ROUGH, self._hints.clicks, self._on_it, self._scale_std)[0]
+            place = few.refine(self.edges, start, ROUGH, self._hints.clicks, self._on_it)[0]
             return _rank(few.evidence(self.edges, place), self.points_at(place, FEW_VIEWS)), place
 
         chosen: list[SimilarityTransform] = []
@@ -242,9 +242,9 @@ class EdgeSearch:
         more exact.
         """
         clicks, edges = self._hints.clicks, self.edges
-        by_both = images.refine(edges, start, False, reaches, clicks, self._on_it, self._scale_std)
-        by_edges = images.refine(edges, start, False, [*reaches, *NEAREST], clicks, None, self._scale_std)
-        in_size = images.refine(edges, by_both[0], True, NEAREST, clicks)[0]
+        by_both = images.refine(edges, start, reaches, clicks, self._on_it)
+        by_edges = images.refine(edges, start, [*reaches, *NEAREST], clicks)
+        in_size = images.refine(edges, by_both[0], NEAREST, clicks, keep_scale=True)[0]
         fits = [
             EdgeRegistration(place, covariance, images.evidence(edges, place), self.points_at(place))
             for place, covariance in (by_edges, (in_size, by_both[1]))
@@ -257,10 +257,10 @@ class EdgeSearch:
 
         def from_view(view: View) -> EdgeRegistration:
             one = EdgeImages([view], self.camera)
-            alone = one.refine(self.edges, found.place, True, NEAREST, self._hints.clicks)[0]
+            alone = one.refine(self.edges, found.place, NEAREST, self._hints.clicks, keep_scale=True)[0]
             pose = camera_from_object(view, alone)
             unit = map_unit(pose, self.edges, view, self._dense[0], self.camera)[0]
-            start = placed(pose, view, unit if unit > 0.0 else alone.scale, self._metric)
+            start = placed(pose, view, unit if unit > 0.0 else alone.scale, self.metric)
             return self._fitted(start, images, NEAREST)
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
@@ -275,9 +275,7 @@ class EdgeSearch:
         seen, images = found.points, self._images(found.place)
         rows = np.flatnonzero(seen.explained | seen.occluded | seen.hidden_by)
         on_it = PointsOnSurface(self._dense[0][rows], self.surface, len(self._dense[1]))
-        place, covariance = images.refine(
-            self.edges, found.place, False, NEAREST, self._hints.clicks, on_it, self._scale_std
-        )
+        place, covariance = images.refine(self.edges, found.place, NEAREST, self._hints.clicks, on_it)
         sized = replace(self.at(place), covariance=covariance)
         apart = abs(np.log(place.scale / found.place.scale))
         agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > MUCH_WORSE * found.rank
@@ -285,7 +283,8 @@ class EdgeSearch:
 
     def _images(self, place: SimilarityTransform) -> EdgeImages:
         """Edges of the keyframes that see the object at a place."""
-        return EdgeImages(views_of(self.edges.nodes, place, self._views, self.camera, MORE_VIEWS), self.camera)
+        views = views_of(self.edges.nodes, place, self._views, self.camera, MORE_VIEWS)
+        return EdgeImages(views, self.camera, self.scale_std)
 
     def at(self, place: SimilarityTransform) -> EdgeRegistration:
         """What speaks for a place as it is."""
@@ -307,7 +306,7 @@ class EdgeSearch:
         """The map with the points of edges and texture of some keyframes, and these."""
         asked = [] if self._hints.region is None else [self._keyframe(self._hints.region[0])]
         # Depth that was measured needs no other keyframe, and has no errors of their poses.
-        with_depth = [view for view in self._views if len(view.depths)] if self._metric else []
+        with_depth = [view for view in self._views if len(view.depths)] if self.metric else []
         spread = spread_views(with_depth or self._views, N_STEREO)
         spread = [view for view in spread if all(view is not each for each in asked)]
         points, views = with_dense_points(self._points, self._views, asked + spread, self.camera)
@@ -366,7 +365,7 @@ class EdgeSearch:
         one = EdgeImages([view], self.camera)
 
         def ranked(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
-            place = one.refine(self.edges, start, True, reaches, (), self._on_it)[0]
+            place = one.refine(self.edges, start, reaches, (), self._on_it, keep_scale=True)[0]
             return _rank(one.evidence(self.edges, place), self._points_in(place, [view])), place
 
         return [place for _, place in sorted(on_all_cores(ranked, starts), key=lambda pair: -pair[0])[:N_FITTED]]
@@ -375,14 +374,14 @@ class EdgeSearch:
         """The best of the hypotheses by their edges and by the points of the map in their outline."""
         unit, agreeing, off_planes, others = found.units(view, self._dense[0], self._off_planes)
         possible = agreeing >= FEWEST_AGREEING
-        if self._metric:
+        if self.metric:
             possible &= np.abs(np.log(np.maximum(unit, 1e-300))) < UNIT_ERROR
         mostly = possible & (agreeing >= AGREEING_SHARE * (agreeing + others))
         by_all = np.where(mostly, found.gains + AGREES * (agreeing - 2 * others), -np.inf)
         by_telling = np.where(possible, found.gains + AGREES * (off_planes - others), -np.inf)
         # A large plane fits any flat face, so that its points may mislead; but the object's faces may be planes.
         best = [*_diverse(found, by_all, N_BY_ALL, N_BY_ALL), *_diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)]
-        return [placed(found.pose(k), view, float(unit[k]), self._metric) for k in dict.fromkeys(best)]
+        return [placed(found.pose(k), view, float(unit[k]), self.metric) for k in dict.fromkeys(best)]
 
     def _where_said(self) -> list[SimilarityTransform]:
         """Where landmarks and a guess have the object."""
@@ -455,7 +454,7 @@ class EdgeSearch:
                 unit = found if found > 0.0 else unit
             if agreeing > most:
                 best, most = unit, agreeing
-        return placed(pose, seen, best, self._metric)
+        return placed(pose, seen, best, self.metric)
 
 
 def _diverse(found: InView, speaking: Array, most: int, most_alike: int) -> list[int]:
