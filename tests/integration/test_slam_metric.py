@@ -73,10 +73,15 @@ def test_frames_without_depth_are_bridged_but_nothing_starts_on_one(with_depth):
     truth, frames = hand_held(36, seed=1), with_depth.frames[:25]
     more = [{} if i == 0 or 10 <= i < 20 else {"depth": frame.depth} for i, frame in enumerate(frames)]
     scene = map_scene(Film([frame.image for frame in frames], more), CAMERA)
-    assert scene.frames[0].reason == NoPose(SlamReason.NO_DEPTH)
+    assert scene.frames[0].status is SlamStatus.FOUND_LATER
     assert {frame.status for frame in scene.frames[1:]} == {SlamStatus.TRACKED}
-    expected = (np.linalg.inv(truth[1]) @ truth[1:25])[:, :3, 3]
+    expected = (np.linalg.inv(truth[1]) @ truth[:25])[:, :3, 3]
     assert np.linalg.norm(scene.trajectory.positions - expected, axis=1).max() < 0.008
+
+
+def test_a_frame_without_depth_starts_nothing_and_says_so(with_depth):
+    (seen,) = follow(Slam(CAMERA, with_depth=True), [with_depth.frames[0].image])
+    assert (seen.status, seen.reason) == (SlamStatus.WAITING, NoPose(SlamReason.NO_DEPTH))
 
 
 def test_too_few_depths_start_nothing(with_depth):

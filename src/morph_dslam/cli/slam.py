@@ -88,6 +88,6 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"note: {flag}")
     print(f"wrote {arguments.output}")
     print(
-        f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_after_start']} "
+        f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_frames']} "
         f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
     )

@@ -16,12 +16,16 @@ STAGES = ("prepare", "start", "track", "map", "relocalise")
 
 
 class SlamStatus(StrEnum):
-    """State of the camera in a frame: waiting for a map, tracked, found again after a loss, or lost."""
+    """State of the camera in a frame: waiting for a map, tracked, found again after a loss, or lost.
+
+    `FOUND_LATER`: the frame had no pose when it came, and has one in the finished map (`second_pass`).
+    """
 
     WAITING = "waiting"
     TRACKED = "tracked"
     RELOCALIZED = "relocalised"
     LOST = "lost"
+    FOUND_LATER = "found later"
 
 
 class SlamReason(Enum):

@@ -58,6 +58,7 @@ def run_slam(
 ) -> dict[str, Any]:
     """Track the camera through a recording, or a live camera's frames, and write the run folder.
 
+    Frames of a recording that had no pose when they came are looked for once more in the finished map.
     An interrupt, or a source that ends early, keeps what was done: the run folder is completed with the frames
     so far and the exception goes on.
 
@@ -113,6 +114,7 @@ def run_slam(
         if progress:
             print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
         slam, frames = start_slam(stream, one_or_two, options, known, recorded), list[SlamFrame]()
+        again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0
         size = (slam.camera.width, slam.camera.height)
         try:
@@ -120,6 +122,7 @@ def run_slam(
                 watch = (lambda image, frame: writer.write(draw_frame(image, frame))) if writer else None
                 for frame in track_frames(slam, stream, progress, watch):
                     frames.append(frame)
+            again = stream if isinstance(stream, FrameSource) and known is None else None
         finally:
             more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
             if refined is not None:
@@ -128,7 +131,7 @@ def run_slam(
                 }
             if isinstance(stream, LiveStream):
                 more["n_dropped"] = stream.dropped - n_before
-            summary = write_run(output, finish_scene(slam, frames), more) if frames else {}
+            summary = write_run(output, finish_scene(slam, frames, again), more) if frames else {}
     return summary
 
 

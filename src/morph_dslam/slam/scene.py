@@ -28,6 +28,7 @@ from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
+from morph_dslam.slam.second_pass import find_rest
 from morph_dslam.slam.self_calibration import (
     CHECKED,
     TERMS,
@@ -153,7 +154,8 @@ def map_scene(
 ) -> Scene:
     """Track a camera through a rigid scene and map the scene.
 
-    A recording's map is made in step with its frames, a live camera's beside them, until an interrupt.
+    A recording's map is made in step with its frames, a live camera's beside them, until an interrupt. Frames of a
+    recording that had no pose when they came are looked for in the finished map (`second_pass`).
 
     Parameters
     ----------
@@ -177,7 +179,7 @@ def map_scene(
         except KeyboardInterrupt:
             if not is_live:
                 raise
-    return finish_scene(slam, frames)
+    return finish_scene(slam, frames, opened if isinstance(opened, FrameSource) and known is None else None)
 
 
 def start_slam(
@@ -215,9 +217,17 @@ def track_frames(
             yield result.record(is_final=slam.is_frozen and not slam.camera.readout_s)
 
 
-def finish_scene(slam: Slam, frames: Sequence[SlamFrame]) -> Scene:
-    """Refine the map, once the sequence is over, and the path by it."""
+def finish_scene(slam: Slam, frames: Sequence[SlamFrame], recording: FrameSource | None = None) -> Scene:
+    """Refine the map, once the sequence is over, and the path by it.
+
+    Parameters
+    ----------
+    slam : what made the map
+    frames : what each frame gave
+    recording : that they are of, to look again for the camera where they have no pose
+    """
     slam.refine_map()
+    frames = frames if recording is None else find_rest(slam, frames, recording)
     trajectory = trajectory_of(slam, frames)
     for _ in range(rolling_shutter.ROUNDS if slam.camera.readout_s and not slam.is_frozen else 0):
         rolling_shutter.correct_map(slam.map, slam.camera, trajectory)
@@ -317,14 +327,15 @@ def _take_in(terms: dict[CameraTerm, TermEstimate], estimate: CameraEstimate) ->
 def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
     placed = set(scene.trajectory.indices.tolist())
     found = [frame for frame in scene.frames if frame.index in placed]
-    after = [frame for frame in scene.frames if found and frame.index >= found[0].index]
+    start = next((frame.index for frame in found if frame.status is not SlamStatus.FOUND_LATER), None)
+    after = [frame for frame in scene.frames if start is not None and frame.index >= start]
     times = np.array([frame.total_ms for frame in after] or [0.0])
     waits = np.array([frame.waited_ms for frame in after] or [0.0])
     errors = [frame.pose.rms_px for frame in found if frame.pose is not None]
     estimate = scene.camera_estimate()
     return {
         "n_frames": len(scene.frames),
-        "start_frame": found[0].index if found else None,
+        "start_frame": start,
         "n_after_start": len(after),
         "status": dict(Counter(str(frame.status) for frame in scene.frames)),
         "n_restarts": slam.n_restarts,

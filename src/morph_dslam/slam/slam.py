@@ -7,6 +7,7 @@ its first view is 1. With depth images, or a stereo pair, it is metric and begin
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -102,6 +103,13 @@ class Slam:
     def _restart(self) -> None:
         self.n_restarts += 1
         self._begin(RigidMap(self.frame_images.baseline_px))
+
+    def finder(self) -> Slam:
+        """One that finds the camera in the map there is now, and leaves the map as it is."""
+        finder = copy(self)
+        finder.is_frozen, finder.threaded = True, False
+        finder._begin(self.map)
+        return finder
 
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k = rigid_map, self.camera.intrinsics

@@ -1,0 +1,48 @@
+"""The camera in a recording's frames that came before its map, or were lost, found in the finished map.
+
+From one moving camera a map begins only when the views have moved apart: until then no frame has a pose. The first
+view is one of the map's keyframes, so that these frames are found once the map is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from morph_dslam.slam.result import SlamFrame, SlamStatus
+from morph_dslam.slam.slam import Slam
+from morph_dslam.sources import FrameSource
+
+
+def find_rest(slam: Slam, frames: Sequence[SlamFrame], source: FrameSource) -> list[SlamFrame]:
+    """Records of all frames of a map, with poses for those that had none where the finished map shows their camera.
+
+    They keep the times and the numbers of their first pass.
+
+    Parameters
+    ----------
+    slam : what made the map, which is finished
+    frames : what each frame gave when it came
+    source : the recording that they are of
+
+    Raises SourceError if the recording cannot be read again.
+    """
+    missing = {frame.index: row for row, frame in enumerate(frames) if not slam.is_placed(frame)}
+    if not slam.map.keyframes or not missing:
+        return list(frames)
+    records, finder, last = list(frames), slam.finder(), max(missing)
+    for image in source:
+        if image.index in missing:
+            found = finder.process_frame(image.image, image.index, image.timestamp, image.depth, image.right)
+            first = records[missing[image.index]]
+            if found.pose is not None:
+                records[missing[image.index]] = replace(
+                    found.record(is_final=False),
+                    status=SlamStatus.FOUND_LATER,
+                    timings_ms=first.timings_ms,
+                    total_ms=first.total_ms,
+                    waited_ms=first.waited_ms,
+                )
+        if image.index == last:
+            break
+    return records
