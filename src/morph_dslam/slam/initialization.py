@@ -18,6 +18,7 @@ from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.options import LEAST_CORRELATION, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import TwoViewHypothesis, rays, refine_pose, reprojection_errors, two_view_hypotheses
 from morph_dslam.slam.result import NoPose, SlamReason
+from morph_dslam.slam.rolling_shutter import velocities
 from morph_dslam.tracking.patches import FLOW_WINDOW, follow, patch_correlation, spread_corners
 
 Array = NDArray[np.float64]
@@ -62,11 +63,15 @@ class _Structure:
 
 @dataclass(frozen=True)
 class MapStart:
-    """An accepted start: three views of the same points and their structure, first camera at the origin."""
+    """An accepted start: three views of the same points and their structure, first camera at the origin.
+
+    ``twists`` (3, 6) are the cameras' velocities, NaN where unknown.
+    """
 
     views: tuple[View, View, View]
     poses: Array
     points: Array
+    twists: Array
 
 
 def turn_residual_px(first: Array, second: Array, intrinsics: Array) -> float:
@@ -99,6 +104,7 @@ class MapInitializer:
     def reset(self) -> None:
         """Forget all views."""
         self._first: View | None = None
+        self._soon: View | None = None
         self._alive = np.empty(0, dtype=bool)
         self._pixels = np.empty((0, 2))
         self._drop_second()
@@ -117,6 +123,7 @@ class MapInitializer:
             reason = self._take_reference(frame)
             return NoPose(SlamReason.FIRST_VIEW_LOST, cause=reason)
         view = View(frame, self._pixels.copy())
+        self._soon = self._soon or view
         return self._verify(view) if self._second is not None else self._propose(view)
 
     def _take_reference(self, frame: FrameView) -> NoPose:
@@ -185,7 +192,18 @@ class MapInitializer:
             return reason
         best = found[0]
         chosen = tuple(View(v.frame, v.pixels[rows][best.fits]) for v in views)
-        return MapStart(chosen, best.poses, best.points[best.fits])  # type: ignore[arg-type]
+        twists = self._velocities(best, rows[best.fits], view.frame)
+        return MapStart(chosen, best.poses, best.points[best.fits], twists)  # type: ignore[arg-type]
+
+    def _velocities(self, best: _Structure, rows: NDArray[np.int64], third: FrameView) -> Array:
+        """The cameras' velocities (3, 6): of the first by the frame after it, of the others by each other."""
+        assert self._first is not None
+        assert self._second is not None
+        assert self._soon is not None
+        soon = refine_pose(np.eye(4), best.points[best.fits], self._soon.pixels[rows], self._intrinsics)
+        frames = [self._first.frame, self._soon.frame, self._second.frame, third]
+        poses = np.stack([np.eye(4), soon.camera_from_world, *best.poses[1:]])
+        return velocities(np.array([frame.timestamp for frame in frames]), poses)[[0, 2, 3]]
 
     def _drop_second(self) -> None:
         self._second: View | None = None

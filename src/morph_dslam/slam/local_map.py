@@ -11,13 +11,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import Camera
+from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.bundle_adjustment import Adjustment, Observations, adjust
 from morph_dslam.slam.frame_images import FrameDepth, depth_of
+from morph_dslam.slam.options import LEAST_INLIERS
 from morph_dslam.slam.pose import check_points, project, rays, reprojection_errors, triangulate, world_points
-from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, Followed, Indices, Keyframe, RigidMap
+from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, UNKNOWN_TWIST, Followed, Indices, Keyframe, RigidMap
+from morph_dslam.slam.rolling_shutter import refined, seen_at_middle_row, velocities
 from morph_dslam.tracking.patches import FLOW_WINDOW, spread_corners
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 #: Disparity from which the depth of a point in one frame makes it a map point, pixels; the baseline of depth images
 #: counts as 8 cm.
 LEAST_DISPARITY_PX = 10.0
@@ -169,7 +174,7 @@ class MapProblem:
     camera_from_world: Array
     positions: Array
     observations: Observations
-    intrinsics: Array
+    camera: Camera
     baseline_px: float
     iterations: int
 
@@ -180,7 +185,7 @@ class MapProblem:
             self.camera_from_world,
             self.positions,
             self.observations,
-            self.intrinsics,
+            self.camera.intrinsics,
             self.held,
             self.baseline_px,
             huber_px=min(max(HUBER_RATIO * usual, LEAST_HUBER_PX), MOST_HUBER_PX),
@@ -193,7 +198,7 @@ class MapProblem:
         seen = self.observations
         poses, points = camera_from_world[seen.camera_idx], positions[seen.point_idx]
         local = np.einsum("oij,oj->oi", poses[:, :3, :3], points) + poses[:, :3, 3]
-        return reprojection_errors(np.eye(4), local, seen.pixels, self.intrinsics)
+        return reprojection_errors(np.eye(4), local, seen.pixels, self.camera.intrinsics)
 
 
 def usual_error(errors: Array) -> float:
@@ -215,11 +220,12 @@ def local_window(rigid_map: RigidMap) -> tuple[Indices, Indices]:
 
 
 def gather(
-    rigid_map: RigidMap, intrinsics: Array, free: Indices, fixed: Indices, iterations: int, hold_poses: bool = False
+    rigid_map: RigidMap, camera: Camera, free: Indices, fixed: Indices, iterations: int, hold_poses: bool = False
 ) -> MapProblem:
-    """The problem of ``free`` keyframes (numbers) and their points, held by ``fixed`` ones; intrinsics (4,).
+    """The problem of ``free`` keyframes (numbers) and their points, held by ``fixed`` ones.
 
-    Where nothing else is held, the oldest free one is; with ``hold_poses`` all are, and only points move.
+    With a rolling shutter, points are where they would be seen at the instant of the middle row. Where nothing else is
+    held, the oldest free one is; with ``hold_poses`` all are, and only points move.
     """
     numbers = np.concatenate([fixed, free])
     held = np.arange(len(numbers)) < (len(numbers) if hold_poses else max(len(fixed), 1))
@@ -231,12 +237,12 @@ def gather(
     ids = np.flatnonzero(wanted)
     local = np.full(len(wanted), -1)
     local[ids] = np.arange(len(ids))
-    chosen = [wanted[keyframe.point_ids] for keyframe in keyframes]
+    seen = [_at_middle_row(rigid_map, camera, k, wanted[k.point_ids]) for k in keyframes]
     observations = Observations(
-        np.repeat(np.arange(len(numbers)), [int(rows.sum()) for rows in chosen]),
-        np.concatenate([local[k.point_ids[rows]] for k, rows in zip(keyframes, chosen, strict=True)]),
-        np.concatenate([k.pixels[rows] for k, rows in zip(keyframes, chosen, strict=True)]),
-        np.concatenate([k.right[rows] for k, rows in zip(keyframes, chosen, strict=True)]),
+        np.repeat(np.arange(len(numbers)), [len(each.ids) for each in seen]),
+        np.concatenate([local[each.ids] for each in seen]),
+        np.concatenate([each.pixels for each in seen]),
+        np.concatenate([each.right for each in seen]),
     )
     return MapProblem(
         numbers,
@@ -246,10 +252,17 @@ def gather(
         np.array([keyframe.camera_from_world for keyframe in keyframes]),
         rigid_map.positions[ids],
         observations,
-        intrinsics,
+        camera,
         rigid_map.baseline_px,
         iterations,
     )
+
+
+def _at_middle_row(rigid_map: RigidMap, camera: Camera, keyframe: Keyframe, rows: Mask) -> Followed:
+    """Those of a keyframe's points, at the middle row's instant."""
+    seen = keyframe.seen[rows]
+    pose, twist = keyframe.camera_from_world, keyframe.twist
+    return seen_at_middle_row(camera, pose, twist, rigid_map.positions[seen.ids], seen)
 
 
 def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> None:
@@ -259,17 +272,18 @@ def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> No
         rigid_map.keyframes[k].camera_from_world = pose
     usual = usual_error(problem.errors(result.camera_from_world, result.points))
     most = min(max(MISS_RATIO * usual, LEAST_MISS_PX), MOST_MISS_PX)
-    _drop_misses(rigid_map, problem.free, problem.intrinsics, most)
+    _drop_misses(rigid_map, problem.free, problem.camera, most)
 
 
-def _drop_misses(rigid_map: RigidMap, numbers: Indices, intrinsics: Array, most_px: float) -> None:
+def _drop_misses(rigid_map: RigidMap, numbers: Indices, camera: Camera, most_px: float) -> None:
     """Take out the observations that contradict the map, then points that fewer than two views see."""
     for k in numbers:
         keyframe = rigid_map.keyframes[k]
-        ids = keyframe.point_ids
-        errors = reprojection_errors(keyframe.camera_from_world, rigid_map.positions[ids], keyframe.pixels, intrinsics)
+        ids, pose = keyframe.point_ids, keyframe.camera_from_world
+        pixels = _at_middle_row(rigid_map, camera, keyframe, np.ones(len(ids), dtype=bool)).pixels
+        errors = reprojection_errors(pose, rigid_map.positions[ids], pixels, camera.intrinsics)
         keyframe.keep((errors < most_px) | (rigid_map.state[ids] != GOOD))
-        _drop_wrong_depths(rigid_map, keyframe, intrinsics)
+        _drop_wrong_depths(rigid_map, keyframe, camera.intrinsics)
     seen = rigid_map.n_observations()
     rigid_map.remove(np.flatnonzero((rigid_map.state == GOOD) & (seen < 2)))
 
@@ -284,3 +298,29 @@ def _drop_wrong_depths(rigid_map: RigidMap, keyframe: Keyframe, intrinsics: Arra
         misses = np.abs(pixels[:, 0] - rigid_map.baseline_px / depths - keyframe.right)
         wrong = (misses > MOST_MISS_PX) & (rigid_map.state[keyframe.point_ids] == GOOD)
     keyframe.right = np.where(wrong, np.nan, keyframe.right)
+
+
+def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> None:
+    """Adjust keyframes and points to the middle rows' instants, with the velocities of the camera's path.
+
+    Keyframes whose velocity the path does not tell take no part; they follow where the points have gone.
+    """
+    rows = {index: row for row, index in enumerate(trajectory.indices.tolist())}
+    twists = velocities(trajectory.timestamps, trajectory.camera_from_world)
+    kept = rigid_map.kept_keyframes
+    for k in kept:
+        keyframe = rigid_map.keyframes[k]
+        keyframe.twist = twists[rows[keyframe.index]] if keyframe.index in rows else UNKNOWN_TWIST
+    known = np.array([np.isfinite(rigid_map.keyframes[k].twist).all() for k in kept], dtype=bool)
+    if known.sum() < 2:
+        return
+    problem = gather(rigid_map, camera, kept[known], kept[:0], iterations=25)
+    result = problem.solve()
+    rigid_map.positions[problem.ids] = result.points
+    for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
+        rigid_map.keyframes[k].camera_from_world = pose
+    for k in kept[~known]:
+        keyframe = rigid_map.keyframes[k]
+        seen = rigid_map.good_of(keyframe.seen)
+        if len(seen.ids) >= LEAST_INLIERS:
+            keyframe.camera_from_world = refined(rigid_map, camera, keyframe.camera_from_world, UNKNOWN_TWIST, seen)

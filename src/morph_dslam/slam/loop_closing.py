@@ -17,6 +17,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from morph_dslam.camera import Camera
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.mapping import Mapper, Work
 from morph_dslam.slam.pose import project
@@ -173,12 +174,12 @@ class LoopCloser:
     n_closed : loops closed so far.
     """
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, mapper: Mapper) -> None:
-        self._map, self._intrinsics, self._mapper = rigid_map, intrinsics, mapper
+    def __init__(self, rigid_map: RigidMap, camera: Camera, mapper: Mapper) -> None:
+        self._map, self._intrinsics, self._mapper = rigid_map, camera.intrinsics, mapper
         # Loops are looked for in the map as it was, while it goes on growing.
         self._copy = RigidMap(rigid_map.baseline_px)
-        self._relocaliser = Relocalizer(self._copy, intrinsics)
-        self._tracker = Tracker(self._copy, intrinsics)
+        self._relocaliser = Relocalizer(self._copy, camera.intrinsics)
+        self._tracker = Tracker(self._copy, camera)
         self._found: Loop | None = None
         self.n_closed = 0
 

@@ -40,9 +40,9 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
 
     Raises MapError if fewer than three frames have a pose, or too few points obey the poses.
     """
-    rigid_map, intrinsics = RigidMap(), np.asarray(images.camera.intrinsics)
-    mapper = Mapper(rigid_map, intrinsics, hold_poses=True, unknown_depth=FAR * trajectory.length)
-    tracker = _PosedTracker(rigid_map, intrinsics)
+    rigid_map = RigidMap()
+    mapper = Mapper(rigid_map, images.camera, hold_poses=True, unknown_depth=FAR * trajectory.length)
+    tracker = _PosedTracker(rigid_map, images.camera)
     times, n_posed = [], 0
     for frame in source:
         times.append(frame.timestamp)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import Camera
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
 from morph_dslam.slam.loop_closing import LoopCloser
@@ -27,12 +28,12 @@ class MapMaking:
         after each step. Tracking then changes nothing of the map but its counts.
     """
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array, tracker: Tracker, threaded: bool) -> None:
+    def __init__(self, rigid_map: RigidMap, camera: Camera, tracker: Tracker, threaded: bool) -> None:
         self._map, self._tracker, self._threaded = rigid_map, tracker, threaded
         self._draft = RigidMap(rigid_map.baseline_px) if threaded else rigid_map
         self._renew()
-        self._mapper = Mapper(self._draft, intrinsics)
-        self._loops = LoopCloser(self._draft, intrinsics, self._mapper)
+        self._mapper = Mapper(self._draft, camera)
+        self._loops = LoopCloser(self._draft, camera, self._mapper)
         self._work, self._search = MappingWork(threaded, self._renew, self._publish), MappingWork(threaded)
         self._kept: tuple[FrameView, Tracked] | None = None
         self._is_waited_for = False

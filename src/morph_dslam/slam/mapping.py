@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import Camera
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
 from morph_dslam.slam.local_map import PointMaker, free_corners, gather, local_window, put_back
@@ -136,21 +137,22 @@ class Mapper:
     """
 
     def __init__(
-        self, rigid_map: RigidMap, intrinsics: Array, hold_poses: bool = False, unknown_depth: float = 1.0
+        self, rigid_map: RigidMap, camera: Camera, hold_poses: bool = False, unknown_depth: float = 1.0
     ) -> None:
-        self._map, self._intrinsics = rigid_map, intrinsics
+        self._map, self._camera, self._intrinsics = rigid_map, camera, camera.intrinsics
         self._hold_poses = hold_poses
-        self._points = PointMaker(rigid_map, intrinsics)
-        self._choice = KeyframeChoice(rigid_map, intrinsics, unknown_depth)
+        self._points = PointMaker(rigid_map, camera.intrinsics)
+        self._choice = KeyframeChoice(rigid_map, camera.intrinsics, unknown_depth)
 
     def begin(self, start: MapStart) -> None:
         """Fill the empty map from three views, median depth 1 in the first."""
         scale = 1.0 / float(np.median(start.points[:, 2]))
         ids = self._map.add_points(scale * start.points, start.views[0].pixels, 0, GOOD)
-        for view, pose in zip(start.views, start.poses, strict=True):
-            scaled = pose.copy()
+        for view, pose, twist in zip(start.views, start.poses, start.twists, strict=True):
+            scaled, velocity = pose.copy(), twist.copy()
             scaled[:3, 3] *= scale
-            self._map.add_keyframe(Keyframe.of_view(view.frame, scaled, Followed(ids.copy(), view.pixels)))
+            velocity[3:] *= scale
+            self._map.add_keyframe(Keyframe.of_view(view.frame, scaled, Followed(ids.copy(), view.pixels), velocity))
         self._adjust_locally()
         self._add_corners(2, start.views[2].frame)
         for keyframe, view in zip(self._map.keyframes, start.views, strict=True):
@@ -174,7 +176,9 @@ class Mapper:
         points must not hold the camera.
         """
         self._map.remove(tracked.moved)
-        number = self._map.add_keyframe(Keyframe.of_view(view, tracked.pose.camera_from_world, tracked.points))
+        number = self._map.add_keyframe(
+            Keyframe.of_view(view, tracked.pose.camera_from_world, tracked.points, tracked.twist)
+        )
         self._points.place_by_depth(number, view.depth)
         self._points.triangulate(number)
         self._points.fuse(number)
@@ -208,7 +212,7 @@ class Mapper:
         self._adjust(window, holders, LOCAL_ITERATIONS)
 
     def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
-        problem = gather(self._map, self._intrinsics, free, fixed, iterations, self._hold_poses)
+        problem = gather(self._map, self._camera, free, fixed, iterations, self._hold_poses)
         put_back(self._map, problem, problem.solve())
 
     def _cull(self) -> None:

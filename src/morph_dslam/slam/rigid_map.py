@@ -42,6 +42,8 @@ MOST_VIEWS = 16
 LEAST_SHARE = 0.75
 #: Error that poses are taken to have before there is any.
 FIRST_RMS_PX = 4.0
+#: Velocity of a camera of which nothing is known.
+UNKNOWN_TWIST = np.full(6, np.nan)
 
 
 @dataclass
@@ -60,6 +62,7 @@ class Keyframe:
     depths : (m, 3) column, row and depth, metres, where a depth image measured it (`FrameDepth.samples`).
     carrier : number of the keyframe that stands for this one since it was taken out, -1 before.
     from_carrier : (4, 4) this one as seen from it.
+    twist : (6,) velocity of the camera by its own axes, as of `rolling_shutter.velocities`; NaN if unknown.
     """
 
     index: int
@@ -74,16 +77,26 @@ class Keyframe:
     depths: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), dtype=np.float32))
     carrier: int = field(default=-1, kw_only=True)
     from_carrier: Array = field(default_factory=lambda: np.eye(4), kw_only=True)
+    twist: Array = field(default_factory=lambda: UNKNOWN_TWIST, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.right is None:
             self.right = np.full(len(self.point_ids), np.nan)
 
     @classmethod
-    def of_view(cls, view: FrameView, camera_from_world: Array, seen: Followed) -> Keyframe:
-        """A frame at a pose (4, 4), with the points seen in it."""
+    def of_view(
+        cls, view: FrameView, camera_from_world: Array, seen: Followed, twist: Array = UNKNOWN_TWIST
+    ) -> Keyframe:
+        """A frame at a pose (4, 4), with the points seen in it, and the camera's velocity (6,)."""
         keyframe = cls(
-            view.index, view.timestamp, view.normalized, camera_from_world, seen.ids, seen.pixels, seen.right
+            view.index,
+            view.timestamp,
+            view.normalized,
+            camera_from_world,
+            seen.ids,
+            seen.pixels,
+            seen.right,
+            twist=twist,
         )
         if view.depth is not None:
             keyframe.depths = view.depth.samples()

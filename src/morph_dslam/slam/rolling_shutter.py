@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
-from morph_dslam.slam.local_map import gather
 from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS
 from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.rigid_map import Followed, RigidMap
@@ -43,13 +42,13 @@ def velocities(timestamps: Array, camera_from_world: Array) -> Array:
         first, last = near[0], near[-1]
         if first != last:
             moved = camera_from_world[last] @ inverse(camera_from_world[first])
-            result[k] = _twist(moved) / (timestamps[last] - timestamps[first])
+            result[k] = twist_of(moved, timestamps[last] - timestamps[first])
     return result
 
 
-def _twist(moved: Array) -> Array:
-    """Rotation vector and translation (6,) of a motion (4, 4)."""
-    return np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]])
+def twist_of(moved: Array, seconds: float) -> Array:
+    """The velocity (6,) of a motion (4, 4), from the left, in some time: rotation vector, then translation."""
+    return np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]]) / seconds
 
 
 def row_times(rows: Array, camera: Camera) -> Array:
@@ -80,6 +79,15 @@ def middle_row_pixels(camera: Camera, camera_from_world: Array, twist: Array, po
     return pixels + np.nan_to_num(camera.project(local) - camera.project(moved))
 
 
+def seen_at_middle_row(
+    camera: Camera, camera_from_world: Array, twist: Array, points: Array, seen: Followed
+) -> Followed:
+    """Where map points, at ``points`` (n, 3), would be seen at the middle row's instant; as of `middle_row_pixels`."""
+    pixels = middle_row_pixels(camera, camera_from_world, twist, points, seen.pixels)
+    # Disparities stay what they were.
+    return Followed(seen.ids, pixels, seen.right + pixels[:, 0] - seen.pixels[:, 0])
+
+
 class RowPoses:
     """Poses of a camera at the instants of single rows, frame by frame: its velocity is that since the frame before.
 
@@ -98,8 +106,8 @@ class RowPoses:
         gap, before = timestamp - self._time, inverse(self._pose)
         self._twist = np.zeros(6)
         for _ in range(ROUNDS if 0.0 < gap < MOST_GAP_S and len(seen.ids) >= LEAST_INLIERS else 0):
-            self._twist = _twist(pose @ before) / gap
-            pose = _refined(self._map, self._camera, pose, self._twist, seen)
+            self._twist = twist_of(pose @ before, gap)
+            pose = refined(self._map, self._camera, pose, self._twist, seen)
         self._time, self._pose = timestamp, pose
 
     def where_seen(self, point: Array) -> Array:
@@ -128,56 +136,22 @@ def correct_path(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory, se
         twists = velocities(trajectory.timestamps, poses)
         for row, points in enumerate(seen):
             if len(points.ids) >= LEAST_INLIERS:
-                poses[row] = _refined(rigid_map, camera, poses[row], twists[row], points)
+                poses[row] = refined(rigid_map, camera, poses[row], twists[row], points)
     return Trajectory(
         trajectory.timestamps, np.array([inverse(pose) for pose in poses]).reshape(-1, 4, 4), trajectory.indices
     )
 
 
-def _refined(rigid_map: RigidMap, camera: Camera, pose: Array, twist: Array, seen: Followed) -> Array:
-    positions = rigid_map.positions[seen.ids]
-    pixels = middle_row_pixels(camera, pose, twist, positions, seen.pixels)
+def refined(rigid_map: RigidMap, camera: Camera, pose: Array, twist: Array, seen: Followed) -> Array:
+    """The pose (4, 4) at the middle row's instant by where a frame saw map points; ``pose`` if by too few."""
+    at_middle = seen_at_middle_row(camera, pose, twist, rigid_map.positions[seen.ids], seen)
     estimate = refine_pose(
         pose,
-        positions,
-        pixels,
+        rigid_map.positions[seen.ids],
+        at_middle.pixels,
         camera.intrinsics,
         inlier_px=INLIER_PX,
-        right=seen.right + pixels[:, 0] - seen.pixels[:, 0],  # disparities stay what they were
+        right=at_middle.right,
         baseline_px=rigid_map.baseline_px,
     )
     return estimate.camera_from_world if estimate.inliers.sum() >= LEAST_INLIERS else pose
-
-
-def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> None:
-    """Adjust keyframes and points to the middle rows' instants.
-
-    Keyframes whose velocity the path does not tell take no part; they follow where the points have gone.
-    """
-    rows = {index: row for row, index in enumerate(trajectory.indices.tolist())}
-    twists = velocities(trajectory.timestamps, trajectory.camera_from_world)
-    kept = rigid_map.kept_keyframes
-    row_of = np.array([rows.get(rigid_map.keyframes[k].index, -1) for k in kept], dtype=np.int64)
-    known = row_of >= 0
-    known[known] = np.isfinite(twists[row_of[known]]).all(axis=1)
-    if known.sum() < 2:
-        return
-    problem = gather(rigid_map, camera.intrinsics, kept[known], kept[:0], iterations=25)
-    observations = problem.observations
-    for number, row in enumerate(row_of[known]):
-        own = observations.camera_idx == number
-        points = problem.positions[observations.point_idx[own]]
-        pose, pixels = problem.camera_from_world[number], observations.pixels[own]
-        observations.pixels[own] = middle_row_pixels(camera, pose, twists[row], points, pixels)
-        if observations.right_columns is not None:
-            observations.right_columns[own] += observations.pixels[own, 0] - pixels[:, 0]
-    result = problem.solve()
-    rigid_map.positions[problem.ids] = result.points
-    for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
-        rigid_map.keyframes[k].camera_from_world = pose
-    for k in kept[~known]:
-        keyframe = rigid_map.keyframes[k]
-        seen = rigid_map.good_of(keyframe.seen)
-        if len(seen.ids) >= LEAST_INLIERS:
-            nowhere = np.full(6, np.nan)
-            keyframe.camera_from_world = _refined(rigid_map, camera, keyframe.camera_from_world, nowhere, seen)

@@ -22,6 +22,7 @@ from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.camera_notes import camera_notes
 from morph_dslam.slam.frame_images import least_distances, orientations
+from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import inverse, refine_pose
@@ -230,7 +231,7 @@ def finish_scene(slam: Slam, frames: Sequence[SlamFrame], recording: FrameSource
     frames = frames if recording is None else find_rest(slam, frames, recording)
     trajectory = trajectory_of(slam, frames)
     for _ in range(rolling_shutter.ROUNDS if slam.camera.readout_s and not slam.is_frozen else 0):
-        rolling_shutter.correct_map(slam.map, slam.camera, trajectory)
+        correct_map(slam.map, slam.camera, trajectory)
         trajectory = trajectory_of(slam, frames)
     return Scene(slam.camera, slam.map, trajectory, tuple(frames), slam)
 

@@ -114,8 +114,8 @@ class Slam:
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k = rigid_map, self.camera.intrinsics
         self._initializer = MapInitializer(k)
-        self._tracker = Tracker(self.map, k)
-        self._making = MapMaking(self.map, k, self._tracker, self.threaded)
+        self._tracker = Tracker(self.map, self.camera)
+        self._making = MapMaking(self.map, self.camera, self._tracker, self.threaded)
         self._relocalizer = Relocalizer(self.map, k)
         # In a map from elsewhere the camera is lost until it is found.
         self._n_lost, self._n_held, self._n_deforming = int(bool(rigid_map.keyframes)), 0, 0

@@ -9,12 +9,13 @@ scene has them do not count for the pose, but are followed on.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.camera import Camera
 from morph_dslam.slam.frame_images import FrameDepth, FrameView
 from morph_dslam.slam.options import INLIER_PX, LEAST_CORRELATION, LEAST_INLIERS, PATCH_HALF
 from morph_dslam.slam.pose import (
@@ -28,7 +29,18 @@ from morph_dslam.slam.pose import (
     reprojection_errors,
 )
 from morph_dslam.slam.result import NoPose, SlamReason
-from morph_dslam.slam.rigid_map import CANDIDATE, FIRST_RMS_PX, GOOD, NOWHERE, REMOVED, Followed, Indices, RigidMap
+from morph_dslam.slam.rigid_map import (
+    CANDIDATE,
+    FIRST_RMS_PX,
+    GOOD,
+    NOWHERE,
+    REMOVED,
+    UNKNOWN_TWIST,
+    Followed,
+    Indices,
+    RigidMap,
+)
+from morph_dslam.slam.rolling_shutter import MOST_GAP_S, seen_at_middle_row, twist_of
 from morph_dslam.slam.templates import Pyramid, Templates, image_pyramid, shape_of
 from morph_dslam.tracking.patches import FLOW_WINDOW, LEVELS
 
@@ -152,7 +164,7 @@ class Sight:
     Least squares from the predicted pose is exact while nearly all points obey the rigid scene. When a part of the
     scene begins to move slowly, such a fit gives way a little everywhere. So a fit that is worse than usual is compared
     with what RANSAC finds: the pose for which most points fit as well as usual. Points that have been in the map for
-    long decide.
+    long decide; without them, in a map of one camera, least squares does.
 
     Parameters
     ----------
@@ -163,7 +175,11 @@ class Sight:
         self._seen, self._intrinsics = seen, intrinsics
         self._positions, self._baseline_px = rigid_map.positions[seen.ids], rigid_map.baseline_px
         senior = rigid_map.first_keyframe[seen.ids] < len(rigid_map.keyframes) - SENIOR_AGE
-        self._judges = senior if senior.sum() >= LEAST_SENIORS else np.ones(len(senior), dtype=bool)
+        has_seniors = senior.sum() >= LEAST_SENIORS
+        self._judges = senior if has_seniors else np.ones(len(senior), dtype=bool)
+        # One camera's first keyframes are so near to each other that the depths are still inexact: then parts of the
+        # scene at other distances seem to move.
+        self._is_reliable = has_seniors or rigid_map.is_metric
         usual_px = rigid_map.usual_rms_px
         self._huber_px = min(HUBER_RATIO * usual_px, MOST_HUBER_PX)
         self._inlier_px = min(max(INLIER_RATIO * usual_px, LEAST_INLIER_PX), INLIER_PX)
@@ -180,7 +196,7 @@ class Sight:
         errors = self._errors(predicted)
         near = errors < max(TRUSTED_RATIO * float(np.median(errors)), self._inlier_px)
         pose = self._fit(predicted, near)
-        if misfit(self._errors(pose.camera_from_world), self._core_px) > MOST_MISFIT:
+        if self._is_reliable and misfit(self._errors(pose.camera_from_world), self._core_px) > MOST_MISFIT:
             pose = self._of_most(pose)
         n = int(pose.inliers.sum())
         if n < max(least, 0.3 * n_seen):
@@ -237,6 +253,7 @@ class Tracked:
     disagreeing : points that look like their map point but are not where a rigid scene would have them.
     moved : (m,) those that surely have moved.
     image_motion_px : how far the points moved since the previous frame, median.
+    twist : (6,) the camera's velocity, as of `Keyframe`.
     """
 
     pose: PoseEstimate
@@ -245,10 +262,13 @@ class Tracked:
     disagreeing: Followed
     moved: Indices = field(default_factory=lambda: NOWHERE.ids)
     image_motion_px: float = 0.0
+    twist: Array = field(default_factory=lambda: UNKNOWN_TWIST)
 
 
 class Tracker:
     """Follows the points of a map.
+
+    With a rolling shutter, poses are those of the middle rows' instants; pixels of points stay where they were seen.
 
     Attributes
     ----------
@@ -256,11 +276,11 @@ class Tracker:
     points : what is followed.
     """
 
-    def __init__(self, rigid_map: RigidMap, intrinsics: Array) -> None:
+    def __init__(self, rigid_map: RigidMap, camera: Camera) -> None:
         self._map = rigid_map
-        self._intrinsics = intrinsics
-        self._motion = np.eye(4)
-        self._templates, self._pyramids = Templates(intrinsics), dict[int, Pyramid]()
+        self._camera, self._intrinsics = camera, camera.intrinsics
+        self._motion, self._twist, self._time = np.eye(4), UNKNOWN_TWIST, -np.inf
+        self._templates, self._pyramids = Templates(self._intrinsics), dict[int, Pyramid]()
         self._views: FewViews | None = None
         self._astray = NOWHERE
         self.camera_from_world = np.eye(4)
@@ -269,7 +289,7 @@ class Tracker:
     def place(self, camera_from_world: Array, points: Followed) -> None:
         """Go on from a pose found by other means, as if the camera had stood still."""
         self.camera_from_world, self.points, self._motion = camera_from_world, points, np.eye(4)
-        self._astray = NOWHERE
+        self._astray, self._twist = NOWHERE, UNKNOWN_TWIST
 
     def correct(self, before: Array, after: Array) -> None:
         """Move along with the newest keyframe, whose pose (4, 4) was ``before`` and now is ``after``."""
@@ -301,6 +321,9 @@ class Tracker:
             result = self._attempt(view, predicted, levels)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
+                gap, self._time = view.timestamp - self._time, view.timestamp
+                self._twist = twist_of(self._motion, gap) if 0.0 < gap < MOST_GAP_S else UNKNOWN_TWIST
+                result = replace(result, twist=self._twist)
                 self.camera_from_world = result.pose.camera_from_world
                 self.points, self._astray = result.points, result.disagreeing
                 rate = 1.0 if self._map.usual_rms_px == FIRST_RMS_PX else USUAL_RATE
@@ -368,7 +391,8 @@ class Tracker:
         if len(pilots.ids) < LEAST_INLIERS:
             return None
         positions = self._map.positions[pilots.ids]
-        pose = refine_pose(start, positions, pilots.pixels, self._intrinsics, inlier_px=INLIER_PX)
+        pixels = self._at_middle_row(pilots, start).pixels
+        pose = refine_pose(start, positions, pixels, self._intrinsics, inlier_px=INLIER_PX)
         return pose.camera_from_world if pose.inliers.mean() > AGREEING_PILOTS else None
 
     def _follow(self, image: Pyramid, points: Followed, pose: Array, levels: int) -> Followed:
@@ -383,8 +407,12 @@ class Tracker:
         """Those of the points that had left the rigid scene that are still away from their places."""
         followed = followed[self._map.state[followed.ids] == GOOD]
         positions = self._map.positions[followed.ids]
-        errors = reprojection_errors(pose, positions, followed.pixels, self._intrinsics)
-        return followed[errors > INLIER_PX]
+        pixels = self._at_middle_row(followed, pose).pixels
+        return followed[reprojection_errors(pose, positions, pixels, self._intrinsics) > INLIER_PX]
+
+    def _at_middle_row(self, seen: Followed, pose: Array) -> Followed:
+        """Where points are seen, at the instant of the frame's middle row, as far as the motion goes on."""
+        return seen_at_middle_row(self._camera, pose, self._twist, self._map.positions[seen.ids], seen)
 
     def find(self, image: Pyramid, guesses: Followed, pose: Array, levels: int) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
@@ -453,7 +481,7 @@ class Tracker:
         )
 
     def _pose(self, start: Array, found: Followed) -> PoseEstimate | NoPose:
-        known = found[self._map.state[found.ids] == GOOD]
+        known = self._at_middle_row(found[self._map.state[found.ids] == GOOD], start)
         return Sight(self._map, known, self._intrinsics).pose(start)
 
     def _search(self, image: Pyramid, pose: Array, followed: Indices) -> Followed:
@@ -471,8 +499,11 @@ class Tracker:
         wanted = Followed(ids, pixels)[inside(pixels, shape_of(image), FLOW_WINDOW)]
         wanted = wanted[self.is_similar_view(wanted.ids, pose)]
         wanted = wanted[self._chosen(wanted.ids, most)]
-        found = self._look_for(image, wanted, pose, NEAR_LEVELS)
-        errors = reprojection_errors(pose, self._map.positions[found.ids], found.pixels, self._intrinsics)
+        # Where they would be seen is as far from there, the other way, as what is seen from the middle row's instant.
+        moved = self._at_middle_row(wanted, pose).pixels - wanted.pixels
+        found = self._look_for(image, Followed(wanted.ids, wanted.pixels - moved), pose, NEAR_LEVELS)
+        pixels = self._at_middle_row(found, pose).pixels
+        errors = reprojection_errors(pose, self._map.positions[found.ids], pixels, self._intrinsics)
         self._map.n_expected[wanted.ids[~self._among(found.ids)[wanted.ids]]] += 1
         return found[errors < SEARCH_RADIUS_PX]
 
