@@ -22,6 +22,7 @@ from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
 from morph_dslam.registration.messages import OtherSize
+from morph_dslam.registration.rectification import inverse_depths_at, rectified_pixels
 from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
@@ -34,6 +35,7 @@ from morph_dslam.registration.scene import MapPoints, View, camera_from_object, 
 from morph_dslam.registration.view_registration import GuessedPose, Hints
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
+from morph_dslam.slam.rolling_shutter import velocities
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.tracking.anchoring import points_on_object
 
@@ -118,8 +120,25 @@ def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sightin
     for frame in np.unique(given.frames).tolist():
         rows = given.frames == frame
         pose = _camera_in(poses, frame, "landmarks")
-        sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(pixels[rows])))
+        there = _at_middle_row(scene, frame, pose, pixels[rows])
+        sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(there)))
     return tuple(sightings)
+
+
+def _at_middle_row(
+    scene: Scene, frame: int, camera_from_world: RigidTransform, pixels: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Pixels (n, 2) of a frame as of the instant of its middle row; as they are where its velocity is unknown."""
+    row = np.flatnonzero(scene.trajectory.indices == frame)
+    if not scene.camera.readout_s or not len(row):
+        return pixels
+    twist = velocities(scene.trajectory.timestamps, scene.trajectory.camera_from_world)[row[0]]
+    local = camera_from_world.apply(scene.points)
+    known = scene.camera.project(local)
+    seen = np.isfinite(known).all(axis=1)
+    if not np.isfinite(twist).all() or not seen.any():
+        return pixels
+    return rectified_pixels(scene.camera, twist, pixels, inverse_depths_at(pixels, known[seen], local[seen, 2]))
 
 
 def _guessed(path: Path, scene: Scene) -> GuessedPose:

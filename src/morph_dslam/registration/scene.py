@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.registration.rectification import rectified_image, rectified_pixels
 from morph_dslam.slam.rigid_map import GOOD
+from morph_dslam.slam.rolling_shutter import middle_row_pixels
 from morph_dslam.slam.scene import Scene
 
 Array = NDArray[np.float64]
@@ -59,7 +61,10 @@ class View:
 
 
 def points_and_views(scene: Scene) -> tuple[MapPoints, Sequence[View]]:
-    """Points and views of a scene's map; each point's viewpoint is the mean place of the keyframes that saw it."""
+    """Points and views of a scene's map; each point's viewpoint is the mean place of the keyframes that saw it.
+
+    What a rolling shutter recorded is moved to the instant of the middle row, which the poses belong to.
+    """
     rigid_map = scene.map
     good = np.flatnonzero(rigid_map.state == GOOD)
     row = np.full(len(rigid_map.state), -1)
@@ -69,15 +74,30 @@ def points_and_views(scene: Scene) -> tuple[MapPoints, Sequence[View]]:
         pose = RigidTransform.from_matrix(keyframe.camera_from_world)
         seen = row[keyframe.point_ids]
         kept = seen >= 0
-        views.append(
-            View(keyframe.index, keyframe.normalized, pose, seen[kept], keyframe.pixels[kept], keyframe.depths)
-        )
+        view = View(keyframe.index, keyframe.normalized, pose, seen[kept], keyframe.pixels[kept], keyframe.depths)
+        views.append(_of_one_instant(view, scene.camera, keyframe.twist, rigid_map.positions[good]))
         total[seen[kept]] += pose.inverse.translation
         count[seen[kept]] += 1.0
     used = count > 0
     everywhere = total.sum(axis=0) / max(count.sum(), 1.0)
     viewpoints = np.where(used[:, None], total / np.maximum(count, 1.0)[:, None], everywhere)
     return MapPoints(rigid_map.positions[good], viewpoints), views
+
+
+def _of_one_instant(view: View, camera: Camera, twist: Array, positions: Array) -> View:
+    """A view of a rolling shutter as of the middle row's instant; as it is if the camera's velocity (6,) is unknown."""
+    if not camera.readout_s or not np.isfinite(twist).all():
+        return view
+    seen = positions[view.point_ids]
+    pixels = middle_row_pixels(camera, view.camera_from_world.matrix, twist, seen, view.pixels)
+    known, depths = view.pixels, view.camera_from_world.apply(seen)[:, 2]
+    samples = view.depths
+    if len(samples):
+        known, depths = samples[:, :2].astype(float), samples[:, 2].astype(float)
+        samples = samples.copy()
+        samples[:, :2] = rectified_pixels(camera, twist, known, 1.0 / depths)
+    image = rectified_image(view.normalized, camera, twist, known, depths)
+    return replace(view, normalized=image, pixels=pixels, depths=samples)
 
 
 def spread_views(views: Sequence[View], most: int) -> list[View]:

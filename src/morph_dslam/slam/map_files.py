@@ -103,7 +103,7 @@ class _PosedTracker(Tracker):
 FORMAT, VERSION = "morph-dslam map", 4
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
 #: Maps of earlier releases have none.
-LATER_KEYFRAME_ARRAYS = ("depths",)
+LATER_KEYFRAME_ARRAYS = ("depths", "twist")
 TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
 
 
