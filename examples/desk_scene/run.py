@@ -2,9 +2,10 @@
 
 The recording (lagadic/visp-images, rbt) is not part of the project: a folder with `rgb/0000.jpg` to `rgb/0098.jpg`,
 `depth/` every third frame (5000 values per metre, as in TUM's layout), `camera.yaml`, `cube.obj` in metres, and the
-camera path `tags_shutter_corrected.txt`. The cube's true pose in frame 0 is from six corners picked by hand (0.95 px),
-which a real cube has rounded. `depth_mm`, the median distance of the measured depth of frame 0 from the cube's faces,
-says how far that pose is off itself: the faces that were measured are 6.5 mm nearer.
+camera path `tags_shutter_corrected.txt`. The cube's true pose in frame 0 is from six corners picked by hand (0.95 px).
+A real cube has rounded corners, so that the picked ones are too near to each other and their pose too far away:
+`depth_mm`, the median distance of the measured depth of frame 0 from the cube's faces, says that the true faces are
+6.5 mm nearer. `measured_mm` is the distance of a place from the picked pose moved along its ray to the measured depth.
 
 Where it was found without a hint in a map of all frames, the cube is tracked through them by their colour, and the
 videos are in output/. (Depth in tracking turns the cube by degrees here, see docs/tracking.md.) `still_mm` and
@@ -14,7 +15,7 @@ path's own errors of a few millimetres are in them.
 The last line gives the largest errors of the cube in frame 0 (centre or size, and angle modulo its 24 rotations), of
 the places found, that of the camera's path from colour alone, how many of four maps give the cube without a hint and
 with three points clicked in frame 25 (landmarks.csv), how many places were unambiguous and wrong, and the longest
-registration, seconds.
+registration, seconds; all by the picked pose. What begins with `measured_` is the same by the measured depth.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ PLACE_LIMIT, ANGLE_LIMIT = 5.0, 3.0
 class Attempt:
     """One registration: its errors (None if nothing was found), whether it is called ambiguous, and its time.
 
-    ``depth_mm`` is `depth_gap` at the place.
+    ``depth_mm`` is `depth_gap` at the place, ``measured_mm`` as ``place_mm`` by `at_measured_depth`.
     """
 
     map: str
@@ -76,32 +77,25 @@ class Attempt:
     place_mm: float | None = None
     angle_deg: float | None = None
     depth_mm: float | None = None
+    measured_mm: float | None = None
     ambiguous: bool = True
 
-    @property
-    def is_right(self) -> bool:
-        return (
-            self.place_mm is not None
-            and self.angle_deg is not None
-            and self.place_mm <= PLACE_LIMIT
-            and self.angle_deg <= ANGLE_LIMIT
-        )
+    def off(self, measured: bool) -> float:
+        """The place's error, mm, by the picked pose or by the measured depth; infinite if there is no place."""
+        found = self.measured_mm if measured else self.place_mm
+        return np.inf if found is None else found
 
-    @property
-    def is_found(self) -> bool:
-        return self.is_right and not self.ambiguous
-
-    @property
-    def is_wrong(self) -> bool:
-        """Unambiguous and wrong."""
-        return not self.ambiguous and not self.is_right
+    def is_right(self, measured: bool) -> bool:
+        """Whether the place is right by the picked pose, or by the measured depth."""
+        return self.off(measured) <= PLACE_LIMIT and self.angle_deg is not None and self.angle_deg <= ANGLE_LIMIT
 
     def line(self) -> str:
         if self.place_mm is None:
             return f"{self.map} {self.hint}: not found ({self.seconds:.1f} s)"
         return (
             f"{self.map} {self.hint}: place_mm={self.place_mm:.2f} angle_deg={self.angle_deg:.2f} "
-            f"depth_mm={self.depth_mm:+.1f} ambiguous={'yes' if self.ambiguous else 'no'} ({self.seconds:.1f} s)"
+            f"measured_mm={self.measured_mm:.2f} depth_mm={self.depth_mm:+.1f} "
+            f"ambiguous={'yes' if self.ambiguous else 'no'} ({self.seconds:.1f} s)"
         )
 
 
@@ -149,6 +143,14 @@ def depth_gap(camera_from_cube: Array, camera: md.Camera, depth: Array) -> float
     beside[np.arange(len(face)), face] = 0.0
     on_face = beside.max(axis=1) < 0.9 * half
     return 1e3 * float(np.median(depth[row, column][on_face] - drawn[on_face]))
+
+
+def at_measured_depth(camera: md.Camera, depth: Array) -> Array:
+    """The picked pose (4, 4) moved along its ray until its faces lie at the measured depth (h, w), metres."""
+    pose = CAMERA_FROM_CUBE.copy()
+    for _ in range(3):
+        pose[:3, 3] *= 1.0 + depth_gap(pose, camera, depth) / 1e3 / pose[2, 3]
+    return pose
 
 
 @dataclass(frozen=True)
@@ -222,9 +224,10 @@ def attempt(
     size = EDGE_MM * abs(placed.scale / unit - 1.0)
     there = np.vstack([np.column_stack([pose[:3, :3] / placed.scale, centre]), [0.0, 0.0, 0.0, 1.0]])
     gap, angle = depth_gap(there, scene.camera, depth), float(np.degrees(min(angles)))
+    measured = 1e3 * float(np.linalg.norm(centre - at_measured_depth(scene.camera, depth)[:3, 3]))
     picture = HERE / "output" / f"{name}_{hint}.jpg"
     cv2.imwrite(str(picture), draw_registration(found, scene))
-    return Attempt(name, hint, seconds, max(off, size), angle, gap, found.ambiguous), found
+    return Attempt(name, hint, seconds, max(off, size), angle, gap, max(measured, size), found.ambiguous), found
 
 
 def write_report(attempts: list[Attempt], tracked: list[Tracked], last_line: str) -> None:
@@ -232,13 +235,14 @@ def write_report(attempts: list[Attempt], tracked: list[Tracked], last_line: str
     lines = [
         "# The cube on the desk",
         "",
-        "| map | hint | place [mm] | angle [deg] | measured depth from its faces [mm] | ambiguous | s |",
-        "|---|---|---|---|---|---|---|",
+        "| map | hint | place [mm] | angle [deg] | by measured depth [mm] | measured depth from its faces [mm] "
+        "| ambiguous | s |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for each in attempts:
-        errors = "- | - | -"
+        errors = "- | - | - | -"
         if each.place_mm is not None:
-            errors = f"{each.place_mm:.2f} | {each.angle_deg:.2f} | {each.depth_mm:+.1f}"
+            errors = f"{each.place_mm:.2f} | {each.angle_deg:.2f} | {each.measured_mm:.2f} | {each.depth_mm:+.1f}"
         doubt = "yes" if each.ambiguous else "no"
         lines.append(f"| {each.map} | {each.hint} | {errors} | {doubt} | {each.seconds:.1f} |")
     pictures = [f"![{each.map}]({each.map}_{each.hint}.jpg)" for each in attempts if each.place_mm is not None]
@@ -246,6 +250,16 @@ def write_report(attempts: list[Attempt], tracked: list[Tracked], last_line: str
     (HERE / "output" / "report.md").write_text(
         "\n".join([*lines, "", *pictures, "", *videos, "", f"`{last_line}`", ""])
     )
+
+
+def counts(attempts: list[Attempt], measured: bool) -> tuple[float, float, str, int]:
+    """Largest errors of the places found, mm and degrees, how many there are by hint, and how many are wrong."""
+    stated = [each for each in attempts if not each.ambiguous]
+    found = [each for each in stated if each.is_right(measured)]
+    plain, hinted = (sum(each.hint == hint for each in found) for hint in ("plain", "clicks"))
+    place = max((each.off(measured) for each in found), default=np.nan)
+    angle = max((each.angle_deg or 0.0 for each in found), default=np.nan)
+    return place, angle, f"found_plain={plain}/4 found_hinted={hinted}/4", len(stated) - len(found)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -273,13 +287,13 @@ def run(arguments: argparse.Namespace) -> None:
             if placed is not None and hint == "plain" and first is None:
                 tracked.append(track_cube(name, scene, placed, frames, truth))
                 print(tracked[-1].line(), flush=True)
-    found = [each for each in attempts if each.is_found]
-    plain, hinted = (sum(each.hint == hint for each in found) for hint in ("plain", "clicks"))
+    picked, measured = (counts(attempts, by_depth) for by_depth in (False, True))
+    place, angle, found, wrong = picked
     last_line = (
-        f"place_mm={max((each.place_mm or 0.0 for each in found), default=np.nan):.2f} "
-        f"angle_deg={max((each.angle_deg or 0.0 for each in found), default=np.nan):.2f} path_mm={path_mm:.2f} "
-        f"found_plain={plain}/4 found_hinted={hinted}/4 wrong={sum(each.is_wrong for each in attempts)} "
-        f"seconds={max(each.seconds for each in attempts):.1f}"
+        f"place_mm={place:.2f} angle_deg={angle:.2f} path_mm={path_mm:.2f} {found} wrong={wrong} "
+        f"seconds={max(each.seconds for each in attempts):.1f} measured_place_mm={measured[0]:.2f} "
+        + " ".join(f"measured_{part}" for part in measured[2].split())
+        + f" measured_wrong={measured[3]}"
     )
     write_report(attempts, tracked, last_line)
     print(last_line)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import fit_similarity
@@ -200,3 +202,37 @@ def path_errors(trajectory, truth):
 def off_the_walls(points):
     """How far points (n, 3) are outside of the room's walls, x = -2, 2, and z = 4, and its floor, y = 1.3, metres."""
     return np.maximum.reduce([np.abs(points[:, 0]) - 2.0, points[:, 2] - 4.0, points[:, 1] - 1.3])
+
+
+def near_box(rng):
+    """A large box 1.2 m before a wall at 3 m."""
+    return [
+        _rectangle([-3.0, -2.5, 3.0], [6.0, 0, 0.3], [0, 5.0, 0.2], [0, 0]),
+        *_box(np.array([0.1, 0.15, 1.4]), np.array([0.5, 0.45, 0.4]), rng),
+    ]
+
+
+def rolling_frames(film, path, readout, bands=12):
+    """Images by a rolling shutter of a camera on a path.
+
+    ``path`` (k, 4, 4) has ``bands`` poses a frame interval; rows are read in ``readout`` intervals around a frame's.
+    """
+    images, height = [], film.camera.height
+    edges = np.linspace(0, height, bands + 1).astype(int)
+    for middle in range(bands, len(path) - bands, bands):
+        image = np.empty((height, film.camera.width), dtype=np.uint8)
+        for first, last in itertools.pairwise(edges.tolist()):
+            instant = middle + bands * readout * (0.5 * (first + last) / height - 0.5)
+            image[first:last] = film.frame(between(path, instant))[first:last]
+        images.append(image)
+    return images
+
+
+def between(path, instant):
+    """The pose of a path (k, 4, 4) at an instant between two of its poses."""
+    k = int(np.clip(np.floor(instant), 0, len(path) - 2))
+    turns = Slerp([0.0, 1.0], Rotation.from_matrix(path[k : k + 2, :3, :3]))
+    result = np.eye(4)
+    result[:3, :3] = turns(instant - k).as_matrix()
+    result[:3, 3] = path[k, :3, 3] + (instant - k) * (path[k + 1, :3, 3] - path[k, :3, 3])
+    return result

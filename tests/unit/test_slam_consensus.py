@@ -5,7 +5,7 @@ import pytest
 
 from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.slam.rigid_map import GOOD, Followed, Keyframe, PassingViews, RigidMap
-from morph_dslam.slam.tracking import Sight
+from morph_dslam.slam.sight import Sight
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 NOISE_PX = 0.2
