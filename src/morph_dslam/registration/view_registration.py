@@ -47,8 +47,8 @@ TELLING_CHANCE = 0.5
 #: No other keyframe is searched if a place has such a rank, and the next one less than such a part of it. Places as
 #: good are fitted again from where each keyframe alone would have them.
 ENOUGH, MUCH_WORSE = 0.3, 0.5
-#: Sizes agree within so many standard deviations.
-SIZES_AGREE = 2.0
+#: Sizes agree within so many standard deviations, where as much as this part still speaks for the place.
+SIZES_AGREE, ABOUT_AS_MUCH = 2.0, 0.8
 #: Hypotheses are alike in a square of so many pixels and within this of the size (log); so many of them are fitted.
 CELL, SIZES_ALIKE, MOST_ALIKE = 64, 0.36, 3
 #: Pixels searched in turn for them: in one keyframe, with few, with more of them, and from near.
@@ -278,7 +278,7 @@ class EdgeSearch:
         place, covariance = images.refine(self.edges, found.place, NEAREST, self._hints.clicks, on_it)
         sized = replace(self.at(place), covariance=covariance)
         apart = abs(np.log(place.scale / found.place.scale))
-        agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > MUCH_WORSE * found.rank
+        agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > ABOUT_AS_MUCH * found.rank
         return sized if agree else found
 
     def _images(self, place: SimilarityTransform) -> EdgeImages:
