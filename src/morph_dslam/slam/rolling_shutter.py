@@ -83,6 +83,8 @@ def seen_at_middle_row(
     camera: Camera, camera_from_world: Array, twist: Array, points: Array, seen: Followed
 ) -> Followed:
     """Where map points, at ``points`` (n, 3), would be seen at the middle row's instant; as of `middle_row_pixels`."""
+    if not camera.readout_s:
+        return seen
     pixels = middle_row_pixels(camera, camera_from_world, twist, points, seen.pixels)
     # Disparities stay what they were.
     return Followed(seen.ids, pixels, seen.right + pixels[:, 0] - seen.pixels[:, 0])
