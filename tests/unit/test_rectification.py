@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
-from morph_dslam.registration.rectification import image_motion, inverse_depths_at, rectified_image, rectified_pixels
+from morph_dslam.registration.rectification import inverse_depths_at, rectified_image
+from morph_dslam.slam.rolling_shutter import middle_row_pixels
 
 CAMERA = Camera(160, 120, 140.0, 145.0, 80.0, 58.0, readout_s=0.04)
 #: Radians and metres a second: the picture moves by up to 16 pixels between its first row and its last.
@@ -42,7 +45,10 @@ def test_the_motion_is_that_of_projected_points():
     points = np.random.default_rng(0).uniform([-0.3, -0.2, 0.4], [0.3, 0.2, 2.0], (50, 3))
     pixels, step = CAMERA.project(points), 1e-5
     expected = (CAMERA.project(moved(points, step)) - CAMERA.project(moved(points, -step))) / (2.0 * step)
-    assert image_motion(CAMERA, TWIST, pixels, 1.0 / points[:, 2]) == pytest.approx(expected, rel=1e-6, abs=1e-4)
+    quick = replace(CAMERA, readout_s=1e-7)
+    rows = (pixels[:, 1] - 0.5 * (CAMERA.height - 1)) / CAMERA.height
+    moves = pixels - middle_row_pixels(quick, np.eye(4), TWIST, points, pixels)
+    assert moves / (quick.readout_s * rows[:, None]) == pytest.approx(expected, rel=1e-6, abs=1e-4)
 
 
 def test_a_picture_and_its_pixels_are_those_of_the_middle_row():
@@ -59,7 +65,8 @@ def test_a_picture_and_its_pixels_are_those_of_the_middle_row():
         seconds = CAMERA.readout_s * (seen[:, 1] - 0.5 * (CAMERA.height - 1)) / CAMERA.height
         seen = np.vstack([CAMERA.project(moved(p[None], t)) for p, t in zip(points, seconds, strict=True)])
     assert np.linalg.norm(seen - before, axis=1).max() > 3.0
-    assert rectified_pixels(CAMERA, TWIST, seen, np.full(3, 1.0 / DEPTH)) == pytest.approx(before, abs=0.5)
+    found = middle_row_pixels(CAMERA, np.eye(4), TWIST, CAMERA.rays(seen) * DEPTH, seen)
+    assert found == pytest.approx(before, abs=0.5)
 
 
 def test_depths_are_those_of_the_points_around_and_far_away_without_any():

@@ -1,8 +1,8 @@
 """Images of a rolling shutter, as a global one would have taken them at the instant of the middle row.
 
-Between its first row and its last one, a moving camera stretches and shears what it sees: by two per cent at 10 pixels
-a frame, which a fit of edges or texture takes for another distance. Where each pixel goes depends on its depth, which
-is that of the map points, or of the depth samples, around it.
+Between its first row and its last one, a moving camera stretches and shears what it sees: by up to two per cent at ten
+pixels a frame, which a fit of edges or texture takes for another distance. Where each pixel goes depends on its depth,
+which is that of the map points, or of the depth samples, around it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from morph_dslam.camera import Camera
-from morph_dslam.slam.rolling_shutter import row_times
+from morph_dslam.slam.rolling_shutter import after, row_times
 
 Array = NDArray[np.float64]
 #: The motion is found at every so many pixels, with the median inverse depth of so many points around.
@@ -29,22 +29,6 @@ def inverse_depths_at(pixels: Array, known_pixels: Array, known_depths: Array) -
     return np.median(1.0 / known_depths[ahead][np.asarray(nearest).reshape(len(pixels), -1)], axis=1)
 
 
-def image_motion(camera: Camera, twist: Array, pixels: Array, inverse_depths: Array) -> Array:
-    """Pixels a second (n, 2) by which still points move in the image of a moving camera (Longuet-Higgins, 1980).
-
-    Parameters
-    ----------
-    camera : without distortion.
-    twist : (6,) the velocity of points that stand still in the camera's axes, as of `rolling_shutter.velocities`.
-    pixels : (n, 2) where they are.
-    inverse_depths : (n,) of them.
-    """
-    fx, fy, cx, cy = camera.intrinsics
-    rays = np.column_stack([(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))])
-    moved = np.cross(twist[:3], rays) + inverse_depths[:, None] * twist[3:]
-    return (moved[:, :2] - rays[:, :2] * moved[:, 2:]) * [fx, fy]
-
-
 def rectified_image(
     image: NDArray[np.uint8], camera: Camera, twist: Array, known_pixels: Array, known_depths: Array
 ) -> NDArray[np.uint8]:
@@ -54,28 +38,21 @@ def rectified_image(
     ----------
     image : as recorded row by row.
     camera : with its readout time.
-    twist : as of `image_motion`.
+    twist : (6,) the camera's velocity, as of `rolling_shutter.velocities`.
     known_pixels, known_depths : (k, 2), (k,) of points whose depth is known.
     """
     height, width = image.shape[:2]
     columns, rows = (CELL * np.arange(-(-side // CELL)) + 0.5 * (CELL - 1) for side in (width, height))
     centres = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    motion = image_motion(camera, twist, centres, inverse_depths_at(centres, known_pixels, known_depths))
-    shift = np.zeros_like(centres)
+    rays, inverse_depths = camera.rays(centres), inverse_depths_at(centres, known_pixels, known_depths)
+    # A point is seen as if it were at depth 1 and the camera's shift divided by its depth.
+    twists = np.column_stack([np.broadcast_to(twist[:3], rays.shape), inverse_depths[:, None] * twist[3:]])
+    seen = centres
     for _ in range(2):  # The row that shows a point is not the one where it would be.
-        shift = motion * _seconds(camera, centres + shift)[:, None]
-    coarse = shift.reshape(len(rows), len(columns), 2).astype(np.float32)
+        seconds = camera.readout_s * row_times(camera.distort_pixels(seen)[:, 1], camera)
+        seen = camera.project(after(rays, twists, seconds))
+    coarse = (seen - centres).reshape(len(rows), len(columns), 2).astype(np.float32)
     fine = cv2.resize(coarse, (CELL * len(columns), CELL * len(rows)), interpolation=cv2.INTER_LINEAR)
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     x, y = u + fine[:height, :width, 0], v + fine[:height, :width, 1]
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
-
-
-def rectified_pixels(camera: Camera, twist: Array, pixels: Array, inverse_depths: Array) -> Array:
-    """Undistorted pixels (n, 2) of a recorded image as of the middle row's instant; as of `image_motion`."""
-    return pixels - image_motion(camera, twist, pixels, inverse_depths) * _seconds(camera, pixels)[:, None]
-
-
-def _seconds(camera: Camera, pixels: Array) -> Array:
-    """Instants (n,) at which undistorted pixels (n, 2) are recorded, after the middle row's."""
-    return camera.readout_s * row_times(camera.distort_pixels(pixels)[:, 1], camera)

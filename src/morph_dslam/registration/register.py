@@ -22,7 +22,7 @@ from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
 from morph_dslam.registration.messages import OtherSize
-from morph_dslam.registration.rectification import inverse_depths_at, rectified_pixels
+from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
@@ -35,7 +35,7 @@ from morph_dslam.registration.scene import MapPoints, View, camera_from_object, 
 from morph_dslam.registration.view_registration import GuessedPose, Hints
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
-from morph_dslam.slam.rolling_shutter import velocities
+from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.tracking.anchoring import points_on_object
 
@@ -116,29 +116,28 @@ def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sightin
     if given.frames is None:
         raise RegistrationError("landmarks in a map need the numbers of their frames: a first column 'frame'")
     pixels = np.ascontiguousarray(scene.camera.undistort_pixels(given.pixels))
-    sightings, poses = [], _camera_poses(scene)
+    sightings, poses, twists = [], _camera_poses(scene), _camera_velocities(scene)
     for frame in np.unique(given.frames).tolist():
         rows = given.frames == frame
         pose = _camera_in(poses, frame, "landmarks")
-        there = _at_middle_row(scene, frame, pose, pixels[rows])
+        there = pixels[rows]
+        if frame in twists:
+            there = _at_middle_row(scene, pose, twists[frame], there)
         sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(there)))
     return tuple(sightings)
 
 
 def _at_middle_row(
-    scene: Scene, frame: int, camera_from_world: RigidTransform, pixels: NDArray[np.float64]
+    scene: Scene, camera_from_world: RigidTransform, twist: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Pixels (n, 2) of a frame as of the instant of its middle row; as they are where its velocity is unknown."""
-    row = np.flatnonzero(scene.trajectory.indices == frame)
-    if not scene.camera.readout_s or not len(row):
-        return pixels
-    twist = velocities(scene.trajectory.timestamps, scene.trajectory.camera_from_world)[row[0]]
+    """Pixels (n, 2) of a frame as of the instant of its middle row, at the depths of the map's points around them."""
     local = camera_from_world.apply(scene.points)
     known = scene.camera.project(local)
     seen = np.isfinite(known).all(axis=1)
-    if not np.isfinite(twist).all() or not seen.any():
+    if not seen.any():
         return pixels
-    return rectified_pixels(scene.camera, twist, pixels, inverse_depths_at(pixels, known[seen], local[seen, 2]))
+    depths = 1.0 / inverse_depths_at(pixels, known[seen], local[seen, 2])
+    return middle_row_pixels(scene.camera, np.eye(4), twist, scene.camera.rays(pixels) * depths[:, None], pixels)
 
 
 def _guessed(path: Path, scene: Scene) -> GuessedPose:
@@ -157,6 +156,14 @@ def _camera_poses(scene: Scene) -> dict[int, NDArray[np.float64]]:
     path = scene.trajectory
     poses = {int(k): np.linalg.inv(m) for k, m in zip(path.indices, path.world_from_camera, strict=True)}
     return poses | {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
+
+
+def _camera_velocities(scene: Scene) -> dict[int, NDArray[np.float64]]:
+    """Velocities (6,) of a rolling shutter by frames of its path; none of a global one."""
+    path = scene.trajectory
+    if not scene.camera.readout_s:
+        return {}
+    return dict(zip(path.indices.tolist(), velocities(path.timestamps, path.camera_from_world), strict=True))
 
 
 def _camera_in(poses: dict[int, NDArray[np.float64]], frame: int, hint: str) -> RigidTransform:

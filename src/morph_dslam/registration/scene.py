@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
-from morph_dslam.registration.rectification import rectified_image, rectified_pixels
+from morph_dslam.registration.rectification import rectified_image
 from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.rolling_shutter import middle_row_pixels
 from morph_dslam.slam.scene import Scene
@@ -95,7 +95,7 @@ def _of_one_instant(view: View, camera: Camera, twist: Array, positions: Array) 
     if len(samples):
         known, depths = samples[:, :2].astype(float), samples[:, 2].astype(float)
         samples = samples.copy()
-        samples[:, :2] = rectified_pixels(camera, twist, known, 1.0 / depths)
+        samples[:, :2] = middle_row_pixels(camera, np.eye(4), twist, camera.rays(known) * depths[:, None], known)
     image = rectified_image(view.normalized, camera, twist, known, depths)
     return replace(view, normalized=image, pixels=pixels, depths=samples)
 

@@ -265,11 +265,15 @@ def _at_middle_row(rigid_map: RigidMap, camera: Camera, keyframe: Keyframe, rows
     return seen_at_middle_row(camera, pose, twist, rigid_map.positions[seen.ids], seen)
 
 
-def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> None:
-    """Take over the adjusted poses and points, and take out what contradicts them."""
+def _take_over(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> None:
     rigid_map.positions[problem.ids] = result.points
     for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
         rigid_map.keyframes[k].camera_from_world = pose
+
+
+def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> None:
+    """Take over the adjusted poses and points, and take out what contradicts them."""
+    _take_over(rigid_map, problem, result)
     usual = usual_error(problem.errors(result.camera_from_world, result.points))
     most = min(max(MISS_RATIO * usual, LEAST_MISS_PX), MOST_MISS_PX)
     _drop_misses(rigid_map, problem.free, problem.camera, most)
@@ -315,10 +319,7 @@ def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> 
     if known.sum() < 2:
         return
     problem = gather(rigid_map, camera, kept[known], kept[:0], iterations=25)
-    result = problem.solve()
-    rigid_map.positions[problem.ids] = result.points
-    for k, pose in zip(problem.numbers, result.camera_from_world, strict=True):
-        rigid_map.keyframes[k].camera_from_world = pose
+    _take_over(rigid_map, problem, problem.solve())
     for k in kept[~known]:
         keyframe = rigid_map.keyframes[k]
         seen = rigid_map.good_of(keyframe.seen)

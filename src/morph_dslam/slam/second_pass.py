@@ -33,16 +33,11 @@ def find_rest(slam: Slam, frames: Sequence[SlamFrame], source: FrameSource) -> l
     records, finder, last = list(frames), slam.finder(), max(missing)
     for image in source:
         if image.index in missing:
+            row = missing[image.index]
             found = finder.process_frame(image.image, image.index, image.timestamp, image.depth, image.right)
-            first = records[missing[image.index]]
             if found.pose is not None:
-                records[missing[image.index]] = replace(
-                    found.record(is_final=False),
-                    status=SlamStatus.FOUND_LATER,
-                    timings_ms=first.timings_ms,
-                    total_ms=first.total_ms,
-                    waited_ms=first.waited_ms,
-                )
+                times = {name: getattr(frames[row], name) for name in ("timings_ms", "total_ms", "waited_ms")}
+                records[row] = replace(found.record(is_final=False), status=SlamStatus.FOUND_LATER, **times)
         if image.index == last:
             break
     return records
