@@ -93,7 +93,7 @@ def benchmark(folder: Path, live: bool) -> str:
         frames, more = follow_live(slam, recorded)
     else:
         frames = follow(slam, recorded)
-    slam.refine_map()
+    frames = slam.refine_map(frames)
     found = [frame for frame in frames if frame.pose is not None]
     if not found:
         return f"start=inf tracked=0/0 (no map: {frames[-1].reason})"

@@ -122,7 +122,7 @@ def waits() -> str:
         queued.append(_queued_ms() - before)
     waited = np.array([frame.waited_ms for frame in frames])
     steps = [frame.timings_ms["map"] for frame in frames]
-    slam.refine_map()
+    frames = slam.refine_map(frames)
     return (
         f"live_{_counts(frames)} loops={slam.n_loops} longest_step_ms={max(steps):.2f} "
         f"longest_wait_ms={waited.max():.2f} queued_ms={queued[int(waited.argmax())]:.2f} "

@@ -171,7 +171,8 @@ def run(film: Film) -> Outcome:
     after = [np.full_like(kept[0], 3)] * FPS + kept[::-1]
     places = [path[-1]] * FPS + list(path[: -FPS - 1 : -1])
     late = [slam.process_frame(image, len(path) + i, i / FPS) for i, image in enumerate(after)]
-    slam.refine_map()
+    refined = slam.refine_map([*frames, *late])
+    frames, late = refined[: len(frames)], refined[len(frames) :]
     return _outcome(slam, frames, late, path, np.array(places))
 
 

@@ -444,8 +444,8 @@ def test_a_reset_begins_anew_in_any_mode(room_film, mode):
 def test_records_of_frames_are_small_and_say_the_same(room_film):
     slam = Slam(CAMERA)
     frames = follow(slam, room_film[0][:60])
+    frames = slam.refine_map(frames)
     records = [frame.record(is_final=False) for frame in frames]
-    slam.refine_map()
     for frame, record in zip(frames, records, strict=True):
         before, after = slam.camera_from_world(frame), slam.camera_from_world(record)
         assert (before is None) == (after is None)
@@ -528,7 +528,7 @@ def test_freezing_waits_for_nobody_and_the_map_stays(room_film, may_go_on):
     slam.freeze()
     may_go_on.set()
     later = beside(slam, room_film[0][after : after + 10], after)
-    slam.refine_map()
+    slam.refine_map(later)
     assert set(statuses(later)) == {TRACKED}
     assert len(slam.map.keyframes) == n_keyframes
     assert np.array_equal(slam.map.positions, positions)

@@ -58,7 +58,7 @@ def followed_and_found_again(images, path):
     """Median error in parts of the path, and the miss of the last of ten frames seen again after a second."""
     slam = Slam(CAMERA)
     frames = follow(slam, [*images, *[np.full_like(images[0], 3)] * 30, *images[:-11:-1]])
-    slam.refine_map()
+    frames = slam.refine_map(frames)
     found = trajectory_of(slam, frames[:N_FRAMES])
     assert {f.status for f in frames[found.indices[0] : N_FRAMES]} == {SlamStatus.TRACKED}
     last = to_truth(found, path).apply(trajectory_of(slam, frames[-1:]).positions)[0]

@@ -78,7 +78,7 @@ def make_anchored_recording(folder):
         slam.process_frame(frame.image, frame.index, frame.timestamp)
         for frame in open_source(folder / "sequence" / "frames", 0, SCAN - 1)
     ]
-    slam.refine_map()
+    frames = slam.refine_map(frames)
     save_map(folder / "map.h5", slam.map, camera)
     write_registration(folder / "registration.json", load_model(folder / "sheet.morph"), slam, frames, truth)
 

@@ -275,7 +275,7 @@ def _scan(folder, models, truth):
         slam.process_frame(cv2.imread(str(folder / "front" / f"{number:06}.png")), number, number / 30.0)
         for number in range(SCAN)
     ]
-    slam.refine_map()
+    frames = slam.refine_map(frames)
     save_map(folder / "map.h5", slam.map, _CAMERA)
     for name, model in models.items():
         (folder / name).mkdir()

@@ -61,7 +61,7 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
     _check(trajectory, source, n_posed, times, rigid_map)
-    mapper.adjust_all()
+    mapper.complete()
     return rigid_map
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
+from morph_dslam.slam.least_squares_matching import Moves
 from morph_dslam.slam.loop_closing import LoopCloser
 from morph_dslam.slam.mapping import Mapper, MappingWork, Work, do_all, one_step
 from morph_dslam.slam.rigid_map import Indices, RigidMap
@@ -108,14 +109,19 @@ class MapMaking:
         else:
             self._proceed(to_end=True)
 
-    def finish(self) -> None:
-        """Bring what has been begun to its end, and adjust all keyframes and points together."""
+    def finish(self) -> Moves:
+        """Bring what has been begun to its end, measure all points again, and adjust them and the keyframes together.
+
+        Returns by how much the points moved in the keyframes.
+        """
         self._search.finish()
         self._proceed(to_end=True)
-        if len(self._map.keyframes) > 2:
-            self._renew()
-            self._mapper.adjust_all()
-            self._publish()
+        if len(self._map.keyframes) <= 2:
+            return {}
+        self._renew()
+        moves = self._mapper.complete()
+        self._publish()
+        return moves
 
     def _insert(self, tracked: Tracked, view: FrameView) -> Work:
         steps = self._mapper.insert(tracked, view)

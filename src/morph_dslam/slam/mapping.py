@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.initialization import MapStart
+from morph_dslam.slam.least_squares_matching import Moves, measure_again
 from morph_dslam.slam.local_map import PointMaker, free_corners, gather, local_window, put_back
 from morph_dslam.slam.options import LEAST_INLIERS
 from morph_dslam.slam.pose import camera_centre, inverse, project
@@ -193,6 +194,13 @@ class Mapper:
     def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
         self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations)
+
+    def complete(self) -> Moves:
+        """Measure all points again, and adjust the whole map to that; by how much they moved in its keyframes."""
+        self.adjust_all()
+        moves = measure_again(self._map, self._intrinsics)
+        self.adjust_all()
+        return moves
 
     def _add_corners(self, number: int, view: FrameView) -> None:
         """New corners to follow."""

@@ -227,7 +227,7 @@ def finish_scene(slam: Slam, frames: Sequence[SlamFrame], recording: FrameSource
     frames : what each frame gave
     recording : that they are of, to look again for the camera where they have no pose
     """
-    slam.refine_map()
+    frames = slam.refine_map(frames)
     frames = frames if recording is None else find_rest(slam, frames, recording)
     trajectory = trajectory_of(slam, frames)
     for _ in range(rolling_shutter.ROUNDS if slam.camera.readout_s and not slam.is_frozen else 0):
@@ -252,9 +252,9 @@ def trajectory_of(slam: Slam, frames: Sequence[SlamFrame]) -> Trajectory:
 
 
 def _seen(slam: Slam, frames: Sequence[SlamFrame], path: Trajectory) -> list[Followed]:
-    """The map points that the frames of a path saw."""
-    by_index = {frame.index: frame for frame in frames}
-    return [slam.map.good_of(by_index[index].points) for index in path.indices.tolist()]
+    """The map points that the frames of a path saw, keyframes as the map has them: that is more exact."""
+    by_index = {frame.index: frame.points for frame in frames} | slam.map.seen_in_keyframes()
+    return [slam.map.good_of(by_index[index]) for index in path.indices.tolist()]
 
 
 def refine_camera(

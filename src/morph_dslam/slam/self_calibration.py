@@ -41,6 +41,8 @@ N_UNKNOWNS = 8
 PRIOR_STD = np.array([0.3, 0.1, 0.1, 0.3, 0.3, 0.002, 0.002, 0.03])
 #: Frames and points that are adjusted, spread over the recording and the most often seen; the fewest that say anything.
 MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 30, 800, 8, 40
+#: Keyframes alone are adjusted where there are so many.
+ENOUGH_KEYFRAMES = 10
 #: A point counts from so many frames on, a frame from so many of these points on; and the share of the frames chosen
 #: that has to count.
 LEAST_VIEWS, LEAST_SEEN, LEAST_CONNECTED = 3, 20, 0.8
@@ -358,7 +360,10 @@ class _Recording:
         self._camera, self._times, self._seen = camera, path.timestamps, seen
         self._poses = path.camera_from_world.copy()
         self._positions = rigid_map.positions.copy()
-        rows = np.flatnonzero([len(points.ids) >= LEAST_SEEN for points in seen])
+        counts = np.array([len(points.ids) >= LEAST_SEEN for points in seen])
+        # What keyframes see was measured more exactly; without enough of them any frames have to do.
+        exact = np.flatnonzero(counts & np.isin(path.indices, list(rigid_map.seen_in_keyframes())))
+        rows = exact if len(exact) >= ENOUGH_KEYFRAMES else np.flatnonzero(counts)
         self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
         # Frames far apart have few points in common: then those in the middle of the recording have to do.
         while len(rows) > 2 * MOST_FRAMES and len(self._rows) < LEAST_CONNECTED * MOST_FRAMES:

@@ -7,6 +7,7 @@ its first view is 1. With depth images, or a stereo pair, it is metric and begin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
 from morph_dslam.slam.frame_images import FrameImages, FrameView
 from morph_dslam.slam.initialization import MapInitializer, MapStart
+from morph_dslam.slam.least_squares_matching import moved_along
 from morph_dslam.slam.local_map import WINDOW
 from morph_dslam.slam.map_making import MapMaking
 from morph_dslam.slam.mapping import pose_in_keyframe
@@ -172,10 +174,22 @@ class Slam:
             self._tracker.drop_candidates()
             self._tracker.choose_views()
 
-    def refine_map(self) -> None:
-        """Adjust all keyframes and points together, once the sequence is over; a frozen map stays."""
-        if not self.is_frozen:
-            self._making.finish()
+    def refine_map(self, frames: Sequence[SlamFrame]) -> list[SlamFrame]:
+        """Measure all points again and adjust them and all keyframes together, once the sequence is over.
+
+        Returns the frames with their points as they are seen in the refined map; a frozen map and its frames stay.
+
+        Parameters
+        ----------
+        frames : what each frame gave
+        """
+        if self.is_frozen:
+            return list(frames)
+        moves = self._making.finish()
+        self._tracker.forget_patches()
+        placed = [frame for frame in frames if self.is_placed(frame)]
+        moved = iter(moved_along(placed, moves, len(self.map.state)))
+        return [next(moved) if self.is_placed(frame) else frame for frame in frames]
 
     @property
     def n_loops(self) -> int:

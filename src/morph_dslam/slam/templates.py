@@ -64,7 +64,7 @@ def _fill(matrix, a, b, c, d):
 
 
 @njit(cache=True, nogil=True)
-def _change(pose, keyframe, position, pixel, camera, out):
+def change_of_view(pose, keyframe, position, pixel, camera, out):
     """Derivative (2, 2) of pixels seen from ``pose`` by the keyframe's, on a plane parallel to its image."""
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     depth = keyframe[2, 3]
@@ -121,7 +121,7 @@ def _choose_changes(ids, views, held_views, held, pose, keyframes, rows, positio
     now = np.empty((2, 2))
     for i in range(len(ids)):
         point = ids[i]
-        _change(pose, keyframes[rows[i]], positions[point], pixels[i], camera, now)
+        change_of_view(pose, keyframes[rows[i]], positions[point], pixels[i], camera, now)
         determinant = now[0, 0] * now[1, 1] - now[0, 1] * now[1, 0]
         if not determinant > 0.0 or not np.isfinite(determinant):
             _fill(now, 1.0, 0.0, 0.0, 1.0)

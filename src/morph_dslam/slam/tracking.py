@@ -181,6 +181,10 @@ class Tracker:
         """Move along with the newest keyframe, whose pose (4, 4) was ``before`` and now is ``after``."""
         self.camera_from_world = self.camera_from_world @ inverse(before) @ after
 
+    def forget_patches(self) -> None:
+        """Cut the points' patches out of their keyframes anew: they are elsewhere there."""
+        self._templates = Templates(self._intrinsics)
+
     def take_up(self, ids: Indices) -> None:
         """Follow further points, from where the newest pose has them."""
         pixels, _ = project(self.camera_from_world, self._map.positions[ids], self._intrinsics)
