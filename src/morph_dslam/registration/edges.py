@@ -38,6 +38,8 @@ EDGE_PX, SHIFT_PX = 1.0, 2.0
 INWARD_PX = 0.7
 #: So many points of a view's edges count as independent.
 INDEPENDENT = 40.0
+#: By so many standard deviations: one-sided, 5 %.
+ONE_SIDED = 1.645
 #: Standard deviation of a landmark that was clicked, pixels.
 CLICK_PX = 2.0
 #: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
@@ -238,6 +240,10 @@ class EdgeEvidence:
     def gain(self) -> float:
         """How much more of the outline than by chance is on edges, of what could be."""
         return _beyond_chance(self.share, self.chance)
+
+    def is_below(self, gain: float) -> bool:
+        """Whether its gain is less than another one by more than the keyframes leave open."""
+        return self.gain + ONE_SIDED * self.gain_std < gain
 
 
 def _beyond_chance(share: float, chance: float) -> float:

@@ -71,10 +71,10 @@ MOST_RIVALS = 3
 #: The runner-up's score over the best's above which they are ambiguous.
 AMBIGUOUS = 0.8
 #: An object laid by its edges is confirmed from this score on, if so much of its outline is on edges, of what chance
-#: does not put there (`AGAINST`, where the images on its surface show its shape), or no less than the keyframes
-#: leave open by so many standard deviations of that share (one-sided, 5 %); where landmarks have it, by the outline
-#: alone.
-CONFIRMED, OUTLINE_SHOWN, ONE_SIDED = 10.0, 0.5, 1.645
+#: does not put there, as far as the keyframes agree on it; where landmarks have it, by the outline alone. A little less
+#: does where images on its surface show its shape: texture hides edges; but a wall and a table have the shape of many
+#: objects, in some size.
+CONFIRMED, OUTLINE_SHOWN, OUTLINE_OF_TEXTURED = 10.0, 0.5, 0.42
 #: Below this score edges that no images confirm are not enough: the points of the map are searched as well.
 SURE = 20.0
 #: Images on the object that show its shape are believed before its edges, unless they lose more than this of the score;
@@ -82,7 +82,7 @@ SURE = 20.0
 LOST, EXACT_PX = 5.0, 0.05
 #: An object of another size than its mesh's by less than so many of these is the same one.
 SAME_SIZE = 3.0
-#: The edges speak against a place found by points below this.
+#: The edges speak against a place found by points below this, if the images on its surface show its shape.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
@@ -151,8 +151,8 @@ class MeshRegistration:
     @property
     def _lacks_edges(self) -> bool:
         """Whether the keyframes show too little of its outline, beyond what they are apart on it."""
-        enough = AGAINST if self.shape_shown else OUTLINE_SHOWN
-        return self.edges is not None and self.edges.gain + ONE_SIDED * self.edges.gain_std < enough
+        enough = OUTLINE_OF_TEXTURED if self.shape_shown else OUTLINE_SHOWN
+        return self.edges is not None and self.edges.is_below(enough)
 
     @property
     def ambiguous(self) -> bool:
@@ -223,8 +223,9 @@ def register_mesh(
     if not there.edges.count and not found.shape_shown:
         # Large enough, an object fits around everything, and its surface to any plane.
         return replace(found, unconfirmed=True)
-    informative = 0.0 < there.edges.chance < TELLING_CHANCE
-    return replace(found, edges=there.edges) if informative and there.edges.gain < AGAINST else found
+    informative = 0.0 < there.edges.chance < TELLING_CHANCE and there.edges.gain < AGAINST
+    contradicts = informative and there.edges.is_below(AGAINST if found.shape_shown else OUTLINE_SHOWN)
+    return replace(found, edges=there.edges) if contradicts else found
 
 
 def _clear(ranks: list[float]) -> bool:

@@ -1,6 +1,6 @@
 """Registration of a mesh by its edges in keyframes, with or without hints of where it is.
 
-Up to three keyframes are searched for the object's edges, or landmarks say where it is in a frame. Points by depth
+Some keyframes are searched for the object's edges, or landmarks say where it is in a frame. Points by depth
 images or stereo on each hypothesis give the unit and speak for it. The best ones are fitted to points and edges of all
 keyframes: a place that is right has its edges on theirs and their points on its surface, and a chance place seldom has
 both.
@@ -44,9 +44,11 @@ N_BY_ALL, N_BY_TELLING = 60, 300
 N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 40, 4, 8, 8
 #: Edges say nothing where chance puts so much of an outline on some.
 TELLING_CHANCE = 0.5
-#: No other keyframe is searched if a place has such a rank, and the next one less than such a part of it. Places as
-#: good are fitted again from where each keyframe alone would have them.
-ENOUGH, MUCH_WORSE = 0.3, 0.5
+#: No other keyframe is searched if a place has such a rank, after the first one and later, and the next place less
+#: than such a part of it. Places as good are fitted again from where each keyframe alone would have them.
+ENOUGH, MUCH_WORSE = (0.5, 0.3), 0.5
+#: So many keyframes are searched for that, and all until a place has this rank.
+N_SEARCHED, SOMETHING = 3, 0.1
 #: Sizes agree within so many standard deviations, where as much as this part still speaks for the place.
 SIZES_AGREE, ABOUT_AS_MUCH = 2.0, 0.8
 #: Hypotheses are alike in a square of so many pixels and within this of the size (log); so many of them are fitted.
@@ -179,10 +181,12 @@ class EdgeSearch:
         if self._hints.clicks or self._hints.guess is not None:
             return self._polished(self._fitted_from(self._where_said()))
         found: list[EdgeRegistration] = []
-        for view in self._searched():
+        for number, view in enumerate(self._searched()):
+            if number >= N_SEARCHED and found and found[0].rank >= SOMETHING:
+                break
             found = self._distinct(found + self._fitted_from(self._in_keyframe(view)))
             ranks = [each.rank for each in found[:2]]
-            if ranks and ranks[0] >= ENOUGH and sum(ranks[1:]) <= MUCH_WORSE * ranks[0]:
+            if ranks and ranks[0] >= ENOUGH[min(number, 1)] and sum(ranks[1:]) <= MUCH_WORSE * ranks[0]:
                 break
             # On a dense texture, edges are everywhere and say nothing, in other keyframes neither.
             if found and found[0].edges.chance >= TELLING_CHANCE:
@@ -190,11 +194,12 @@ class EdgeSearch:
         return self._polished(found)
 
     def _searched(self) -> list[View]:
-        """Keyframes in which the object is searched: that of the region; or one in the middle, an early, a late one."""
+        """Keyframes to search: that of the region; or one in the middle, an early, a late one, and the others."""
         views = self._dense[1]
         if self._hints.region is not None or not views:
             return views[:1]
-        return [views[k] for k in dict.fromkeys([len(views) // 2, len(views) // 6, 5 * len(views) // 6])]
+        first = [len(views) // 2, len(views) // 6, 5 * len(views) // 6]
+        return [views[k] for k in dict.fromkeys([*first, *range(len(views))])]
 
     def _fitted_from(self, starts: Sequence[SimilarityTransform]) -> list[EdgeRegistration]:
         """Distinct places near some others, the best first."""
