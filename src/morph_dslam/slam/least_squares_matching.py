@@ -24,7 +24,6 @@ from morph_dslam.slam.templates import change_of_view
 from morph_dslam.tracking.patches import FAST, NEUTRAL
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 #: Half the side of a patch, pixels, and the standard deviation of the weights that fall off from its middle.
 HALF, WEIGHT_STD_PX = 10, 6.0
@@ -131,61 +130,70 @@ def _left_over(differences, patch, weights, slopes, step):
     return left / max(square - mean * mean / total, 1e-6), left / (total - _N_UNKNOWNS)
 
 
+@njit(cache=True, nogil=True)
+def _compose(warp, step):
+    """Change a warp (2, 2) to what it is after the inverse of a step; whether there is one."""
+    p, q, r, s = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
+    determinant = p * s - q * r
+    if not determinant > 0.1:
+        return False
+    for row in range(2):
+        first, second = warp[row, 0], warp[row, 1]
+        warp[row, 0], warp[row, 1] = (first * s - second * r) / determinant, (second * p - first * q) / determinant
+    return True
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
+def _find(image, guess, warp, patch, slopes, inverse_normal, weights):
+    """Move a guess (2,) in an image to where a patch is, if it is there; from its warp (2, 2), which is changed."""
+    differences, step, right = np.empty(_N, _F32), np.zeros(_N_UNKNOWNS), np.empty(_N_UNKNOWNS)
+    u, v = guess
+    for _ in range(MOST_STEPS):
+        if not (_is_sound(warp) and _warped(image, u, v, warp, differences)):
+            return False
+        for k in range(_N):
+            differences[k] -= patch[k]
+        for a in range(_N_UNKNOWNS):
+            value = _F32(0.0)
+            for k in range(_N):
+                value += slopes[a, k] * differences[k]
+            right[a] = value
+        for a in range(_N_UNKNOWNS):
+            step[a] = 0.0
+            for b in range(_N_UNKNOWNS):
+                step[a] += inverse_normal[a, b] * right[b]
+        if not _compose(warp, step):
+            return False
+        move_x = warp[0, 0] * step[0] + warp[0, 1] * step[1]
+        move_y = warp[1, 0] * step[0] + warp[1, 1] * step[1]
+        u, v = u - move_x, v - move_y
+        if math.hypot(u - guess[0], v - guess[1]) > MOST_MOVE_PX:
+            return False
+        if math.hypot(move_x, move_y) < LAST_STEP:
+            part, variance = _left_over(differences, patch, weights, slopes, step)
+            spread = variance * (inverse_normal[0, 0] + inverse_normal[1, 1])
+            guess[0], guess[1] = u, v
+            return part < 1.0 - LEAST_MATCH**2 and spread < MOST_STD_PX**2
+    return False
+
+
+@njit(cache=True, nogil=True)
 def _match(reference, image, places, guesses, warps, weights, found):
     """Move the guesses (n, 2) in an image to where the patches about ``places`` (n, 2) of a reference are.
 
     Parameters
     ----------
-    warps : (n, 2, 2) to begin with.
-    found : (n,) which were matched.
+    warps : (n, 2, 2) to begin with, changed.
+    found : (n,) which were matched; the guesses of the others mean nothing.
     """
     patch, slopes = np.empty(_N, _F32), np.empty((_N_UNKNOWNS, _N), _F32)
-    differences, step, right = np.empty(_N, _F32), np.zeros(_N_UNKNOWNS), np.empty(_N_UNKNOWNS)
     height, width = reference.shape
     for i in range(len(places)):
-        found[i] = False
         x, y = places[i, 0], places[i, 1]
-        if min(x, y) < HALF + 2 or x > width - HALF - 4 or y > height - HALF - 4:
-            continue
-        inverse_normal = _prepare(reference, x, y, weights, patch, slopes)
-        warp, u, v = warps[i], guesses[i, 0], guesses[i, 1]
-        for _ in range(MOST_STEPS):
-            if not (_is_sound(warp) and _warped(image, u, v, warp, differences)):
-                break
-            for k in range(_N):
-                differences[k] -= patch[k]
-            for a in range(_N_UNKNOWNS):
-                value = _F32(0.0)
-                for k in range(_N):
-                    value += slopes[a, k] * differences[k]
-                right[a] = value
-            for a in range(_N_UNKNOWNS):
-                step[a] = 0.0
-                for b in range(_N_UNKNOWNS):
-                    step[a] += inverse_normal[a, b] * right[b]
-            # The warp after the inverse of the step.
-            p, q, r, s = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
-            determinant = p * s - q * r
-            if not determinant > 0.1:
-                break
-            first, second = warp[0, 0], warp[0, 1]
-            warp[0, 0], warp[0, 1] = (first * s - second * r) / determinant, (second * p - first * q) / determinant
-            first, second = warp[1, 0], warp[1, 1]
-            warp[1, 0], warp[1, 1] = (first * s - second * r) / determinant, (second * p - first * q) / determinant
-            move_x = warp[0, 0] * step[0] + warp[0, 1] * step[1]
-            move_y = warp[1, 0] * step[0] + warp[1, 1] * step[1]
-            u -= move_x
-            v -= move_y
-            if math.hypot(u - guesses[i, 0], v - guesses[i, 1]) > MOST_MOVE_PX:
-                break
-            if math.hypot(move_x, move_y) < LAST_STEP:
-                part, variance = _left_over(differences, patch, weights, slopes, step)
-                spread = variance * (inverse_normal[0, 0] + inverse_normal[1, 1])
-                found[i] = part < 1.0 - LEAST_MATCH**2 and spread < MOST_STD_PX**2
-                break
+        found[i] = min(x, y) >= HALF + 2 and x <= width - HALF - 4 and y <= height - HALF - 4
         if found[i]:
-            guesses[i, 0], guesses[i, 1] = u, v
+            inverse_normal = _prepare(reference, x, y, weights, patch, slopes)
+            found[i] = _find(image, guesses[i], warps[i], patch, slopes, inverse_normal, weights)
 
 
 #: By how much points moved (n, 2) in a keyframe, with their numbers (n,), by the keyframe's number.
