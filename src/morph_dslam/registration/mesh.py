@@ -82,7 +82,7 @@ SURE = 20.0
 LOST, EXACT_PX = 5.0, 0.05
 #: An object of another size than its mesh's by less than so many of these is the same one.
 SAME_SIZE = 3.0
-#: The edges speak against a place found by points below this, if the images on its surface show its shape.
+#: The edges speak against a place found by points below this.
 AGAINST = 0.25
 #: So many of the best places are compared by the images on them, if they score at least this part of the
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak

@@ -212,7 +212,6 @@ def measure_again(rigid_map: RigidMap, intrinsics: Array) -> Moves:
     intrinsics : (4,) of the keyframes' images
     """
     kept = rigid_map.kept_keyframes.tolist()
-    poses = {k: rigid_map.keyframes[k].camera_from_world for k in kept}
     references = _reference_views(rigid_map, kept)
     found = {k: np.zeros(len(rigid_map.keyframes[k].point_ids), dtype=bool) for k in kept}
     pixels = {k: rigid_map.keyframes[k].pixels.copy() for k in kept}
@@ -225,15 +224,13 @@ def measure_again(rigid_map: RigidMap, intrinsics: Array) -> Moves:
             rows = np.flatnonzero(references[keyframe.point_ids] == reference)
             if k == reference:
                 found[k][rows] = True
-                continue
-            if not len(rows):
-                continue
-            ids = keyframe.point_ids[rows]
-            places = at.pixels[at.rows_of(ids)[0]]
-            warps = _warps(poses[k], poses[reference], rigid_map.positions[ids], places, intrinsics)
-            moved, is_found = pixels[k][rows], np.zeros(len(rows), dtype=bool)
-            _match(at.normalized, keyframe.normalized, places, moved, warps, weights, is_found)
-            pixels[k][rows], found[k][rows] = moved, is_found
+            elif len(rows):
+                ids = keyframe.point_ids[rows]
+                places, poses = at.pixels[at.rows_of(ids)[0]], (keyframe.camera_from_world, at.camera_from_world)
+                warps = _warps(*poses, rigid_map.positions[ids], places, intrinsics)
+                moved, is_found = pixels[k][rows], np.zeros(len(rows), dtype=bool)
+                _match(at.normalized, keyframe.normalized, places, moved, warps, weights, is_found)
+                pixels[k][rows], found[k][rows] = moved, is_found
     return _take_over(rigid_map, found, pixels)
 
 

@@ -360,10 +360,10 @@ class _Recording:
         self._camera, self._times, self._seen = camera, path.timestamps, seen
         self._poses = path.camera_from_world.copy()
         self._positions = rigid_map.positions.copy()
-        counts = np.array([len(points.ids) >= LEAST_SEEN for points in seen])
+        sees_enough = np.array([len(points.ids) >= LEAST_SEEN for points in seen])
         # What keyframes see was measured more exactly; without enough of them any frames have to do.
-        exact = np.flatnonzero(counts & np.isin(path.indices, list(rigid_map.seen_in_keyframes())))
-        rows = exact if len(exact) >= ENOUGH_KEYFRAMES else np.flatnonzero(counts)
+        exact = np.flatnonzero(sees_enough & np.isin(path.indices, list(rigid_map.seen_in_keyframes())))
+        rows = exact if len(exact) >= ENOUGH_KEYFRAMES else np.flatnonzero(sees_enough)
         self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
         # Frames far apart have few points in common: then those in the middle of the recording have to do.
         while len(rows) > 2 * MOST_FRAMES and len(self._rows) < LEAST_CONNECTED * MOST_FRAMES:
