@@ -84,6 +84,31 @@ def test_the_contour_of_a_sphere_is_its_tangent_cone():
         assert np.diff(angles).max() < 4 * 2.0 * np.pi / len(pixels)
 
 
+@pytest.mark.parametrize("ground", [30.0, 90.0], ids=["as bright as the rim", "as bright as within"])
+def test_the_outline_of_a_shaded_ball_is_where_it_turns_away(ground):
+    """Lit from the camera (Lambert), it is darkest at its rim, which may be as bright as the ground.
+
+    Its disc has a radius of f r / sqrt(d² - r²), and a sight line meets it at an angle whose cosine is in closed form.
+    """
+    model, distance, radius = inflated(60, 0.05), 0.3, 0.05
+    u, v = (np.arange(4 * n) / 4.0 - 0.375 for n in (640, 480))
+    squared = ((u[None] - 320.0) ** 2 + (v[:, None] - 240.0) ** 2) / 520.0**2
+    # Of sight lines a t with |a|² = 1 + squared, those that meet the ball: its normal there is (a t - c) / r.
+    inner = distance**2 - (1.0 + squared) * (distance**2 - radius**2)
+    cosine = np.sqrt(np.maximum(inner, 0.0)) / radius / np.sqrt(1.0 + squared)
+    fine = np.where(inner > 0.0, 30.0 + 180.0 * cosine, ground).reshape(480, 4, 640, 4).mean(axis=(1, 3))
+    noise = np.random.default_rng(2).normal(0.0, 1.0, fine.shape)
+    grey = np.clip(np.rint(cv2.GaussianBlur(fine, (0, 0), 0.6) + noise), 0, 255).astype(np.uint8)
+    off = RigidTransform(np.eye(3), np.array([0.0005, -0.0005, distance + 0.002]))
+    seen = outline_of(model).measure(grey, State(np.zeros(1), off), 14)
+    radii = np.hypot(*(seen.pixels[seen.valid] - [320.0, 240.0]).T)
+    errors = radii - 520.0 * radius / np.sqrt(distance**2 - radius**2)
+    # The steepest place is off by 0.9 pixels, and by 2.8 on the ground that the surface is as bright as within the rim.
+    assert seen.valid.sum() > 0.5 * seen.expected.sum() > 50
+    assert abs(np.median(errors)) < 0.4
+    assert np.percentile(np.abs(errors), 95) < 0.8
+
+
 def test_the_rims_of_a_hole_and_what_lies_behind_it_count_as_they_are_seen():
     """Of a plate with a square hole, seen from the front, the rims nearer to the camera; the far ones are hidden."""
     mesh = block((0.12, 0.12, 0.01), (12, 12, 1), "hex8")

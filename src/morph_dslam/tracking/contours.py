@@ -70,11 +70,13 @@ class Contour:
     points : (k,) on the surface.
     pixels : (k, 2) where they are seen
     normals : (k, 2) across the contour, outwards.
+    turns_away : (k,) whether a smooth surface turns away there; it ends, or has a sharp edge, elsewhere.
     """
 
     points: SurfacePoints
     pixels: Array
     normals: Array
+    turns_away: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -103,7 +105,7 @@ def find_contour(
     occluder_depth : (h, w) of other objects, infinite where there are none.
     """
     occluders = np.empty((0, 0), dtype=np.float32) if occluder_depth is None else occluder_depth
-    rows, shares, places, normals = _candidates(edges.nodes, nodes, pixels, depth, occluders, focal, size)
+    rows, shares, places, normals, turns_away = _candidates(edges.nodes, nodes, pixels, depth, occluders, focal, size)
     apart = STEP_PX * len(rows) / max(count, 1)
     chosen = _spread(places, normals, apart, count)
     rows, shares = rows[chosen], shares[chosen]
@@ -111,7 +113,8 @@ def find_contour(
     every = np.arange(len(rows))
     weights[every, edges.corners[rows, 0]] = 1.0 - shares
     weights[every, edges.corners[rows, 1]] = shares
-    return Contour(SurfacePoints(edges.triangles[rows], weights), places[chosen], normals[chosen])
+    points = SurfacePoints(edges.triangles[rows], weights)
+    return Contour(points, places[chosen], normals[chosen], turns_away[chosen])
 
 
 @njit(cache=True, nogil=True)
@@ -124,24 +127,24 @@ def _side(pixels, start, end, other):
 
 @njit(cache=True, nogil=True)
 def _normal(edge, nodes, nx, ny):
-    """Outward normal in the image of the contour at an edge whose own normal is (nx, ny).
+    """Outward normal in the image of the contour at an edge whose own normal is (nx, ny), and whether it is smooth.
 
     Where a smooth surface turns away, edges run zigzag along its contour. There the plane that touches the surface
     holds the sight line, and its trace in the image is the contour's tangent.
     """
     if edge[3] < 0:
-        return nx, ny
+        return nx, ny, False
     a, b = nodes[edge[0]], nodes[edge[1]]
     first, second = np.cross(b - a, nodes[edge[2]] - a), np.cross(a - b, nodes[edge[3]] - b)
     sizes = np.sqrt(np.dot(first, first)), np.sqrt(np.dot(second, second))
     if not min(sizes) > 0.0 or np.dot(first, second) < SMOOTH * sizes[0] * sizes[1]:
-        return nx, ny
+        return nx, ny, False
     x, y = first[0] / sizes[0] + second[0] / sizes[1], first[1] / sizes[0] + second[1] / sizes[1]
     along, length = x * nx + y * ny, np.hypot(x, y)
     if not abs(along) > PARALLEL * length:
-        return nx, ny
+        return nx, ny, True
     length = np.copysign(length, along)
-    return x / length, y / length
+    return x / length, y / length, True
 
 
 @njit(cache=True, nogil=True)
@@ -165,14 +168,15 @@ def _is_seen(x, y, nx, ny, z, jump, depth, occluders):
 
 @njit(cache=True, nogil=True)
 def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
-    """Edges (k,), shares of their length (k,), pixels (k, 2) and outward normals (k, 2) of what is seen of the contour.
+    """Edges (k,), shares of their length (k,), pixels (k, 2) and outward normals (k, 2) of what is seen of the contour,
+    and whether the surface is smooth (k,) there.
 
     Every `STEP_PX` pixels along the edges, one after the other.
     """
     height, width = depth.shape
     capacity, count = 4096, 0
     rows, shares = np.empty(capacity, np.int64), np.empty(capacity)
-    places, normals = np.empty((capacity, 2)), np.empty((capacity, 2))
+    places, normals, smooth = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity, np.bool_)
     left = 0.5 * STEP_PX
     for e in range(len(edges)):
         start, end = edges[e, 0], edges[e, 1]
@@ -185,7 +189,7 @@ def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
             continue
         # The side of the opposite node is inside.
         turn = -1.0 if side > 0.0 else 1.0
-        nx, ny = _normal(edges[e], nodes, -turn * dy / length, turn * dx / length)
+        nx, ny, is_smooth = _normal(edges[e], nodes, -turn * dy / length, turn * dx / length)
         along = left
         while along < length:
             share = along / length
@@ -204,12 +208,14 @@ def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
                     np.concatenate((places, np.empty((count, 2)))),
                     np.concatenate((normals, np.empty((count, 2)))),
                 )
+                smooth = np.append(smooth, np.empty(count, np.bool_))
             rows[count], shares[count] = e, last * z
             places[count, 0], places[count, 1] = x, y
             normals[count, 0], normals[count, 1] = nx, ny
+            smooth[count] = is_smooth
             count += 1
         left = along - length
-    return rows[:count], shares[:count], places[:count], normals[:count]
+    return rows[:count], shares[:count], places[:count], normals[:count], smooth[:count]
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.render.rasteriser import draw_depth
 from morph_dslam.tracking.binding import Drawing, DrawnSurface, View, view_of
 from morph_dslam.tracking.contours import Contour, SurfaceEdges, find_contour
+from morph_dslam.tracking.edge_profiles import LIKELY_LEVELS, SIDE_PX, search_outline
 from morph_dslam.tracking.estimator import BoundPoints, State
 
 Array = NDArray[np.float64]
@@ -30,17 +31,6 @@ N_POINTS = 160
 REACH_PX = 14
 #: While its points move by less than this, pixels, the contour is looked for along the same points of the surface.
 SAME_CONTOUR_PX = 8.0
-#: Pixels averaged on each side of a candidate.
-SIDE_PX = 4
-#: How far from the candidate the steepest place is looked for, pixels.
-STEEPEST_PX = 3
-#: Grey levels by which the two sides must differ.
-LEAST_CONTRAST = 10.0
-#: Largest difference of the inner side from its brightness in the first picture, relative to that; shading
-#: changes it as the surface bends.
-BRIGHTNESS_TOLERANCE = 0.35
-#: Grey levels by which a side may differ from it until the candidate's score halves.
-LIKELY_LEVELS = 12.0
 #: What is beside an outline: from and up to so many pixels off, within so many median deviations, by so many points.
 BESIDE_PX, SPREADS, FEWEST_KNOWN = (4, 9), 4.5, 12
 
@@ -224,11 +214,7 @@ class Outline:
         Points stay in the places of those that were near them last: what one errs by is then known as the same.
         """
         slots, normals_there = self._slots, self._contour.normals
-        offsets = np.asarray(
-            search_outline(
-                grey, places, normals_there, self._beside, reach, SIDE_PX, LEAST_CONTRAST, BRIGHTNESS_TOLERANCE
-            )
-        )
+        offsets = np.asarray(search_outline(grey, places, normals_there, self._contour.turns_away, self._beside, reach))
         found = np.zeros(N_POINTS)
         found[slots] = np.isfinite(offsets)
         pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))
@@ -330,106 +316,4 @@ def look_up(pixels, ids, triangles, nodes, known_nodes, known_depth, known_grey,
         y = int(np.rint(intrinsics[1] * there[1] / there[2] + intrinsics[3]))
         if 0 <= x < width and 0 <= y < height and 0.99 < there[2] / known_depth[y, x] < 1.01:
             result[j] = known_grey[y, x]
-    return result
-
-
-@njit(cache=True, nogil=True)
-def _read_profile(grey, x, y, nx, ny, first, profile):
-    """Fill a profile with the image along a normal from ``first`` pixels on; NaN beyond the border."""
-    height, width = grey.shape
-    for k in range(len(profile)):
-        u, v = x + (k + first) * nx, y + (k + first) * ny
-        profile[k] = np.nan
-        if u < 0.0 or v < 0.0 or u >= width - 1 or v >= height - 1:
-            continue
-        u0, v0 = int(u), int(v)
-        a, b = u - u0, v - v0
-        above = (1.0 - a) * grey[v0, u0] + a * grey[v0, u0 + 1]
-        below = (1.0 - a) * grey[v0 + 1, u0] + a * grey[v0 + 1, u0 + 1]
-        profile[k] = (1.0 - b) * above + b * below
-
-
-@njit(cache=True, nogil=True)
-def _likelihood(profile, middle, brightness):
-    """How well both sides (2, n) of a place in a profile look as the object did there; 1 where that is not known."""
-    result = 1.0
-    for which in range(2):
-        differs, count = 0.0, 0
-        for i in range(1, brightness.shape[1]):  # what is right at the contour is blurred with the other side
-            there = brightness[which, i]
-            if np.isfinite(there):
-                differs += abs(profile[middle + (2 * which - 1) * (i + 1)] - there)
-                count += 1
-        if count:
-            result /= 1.0 + (differs / count / LIKELY_LEVELS) ** 2
-    return result
-
-
-@njit(cache=True, nogil=True)
-def _best_step(profile, brightness, inside, reach, side, least_contrast, tolerance, steps):
-    """Index of the best of the candidates whose contrasts fill ``steps`` (2 reach + 1,); -1 if there is none."""
-    best, highest = -1, 0.0
-    for k in range(len(steps)):
-        inner, outer = 0.0, 0.0
-        for i in range(1, side + 1):
-            inner += profile[k + side - i]
-            outer += profile[k + side + i]
-        inner, outer = inner / side, outer / side
-        steps[k] = abs(inner - outer)
-        if not np.isfinite(steps[k]) or abs(inner - inside) > tolerance * inside + least_contrast:
-            steps[k] = 0.0
-        if steps[k] <= least_contrast:
-            continue
-        away = 2.0 * (k - reach) / reach
-        score = steps[k] / (1.0 + away * away) * _likelihood(profile, k + side, brightness)
-        if best < 0 or score > highest:
-            best, highest = k, score
-    # The nearest one may be on the slope of a step: its top is where the step is.
-    while 0 < best < 2 * reach and max(steps[best - 1], steps[best + 1]) > steps[best]:
-        best += 1 if steps[best + 1] > steps[best - 1] else -1
-    return best if 0 < best < 2 * reach else -1
-
-
-@njit(cache=True, nogil=True)
-def _steepest(profile, middle, slopes):
-    """Where a profile is steepest near a place, to a fraction of a pixel by a parabola; NaN if it is not nearby."""
-    first, last = max(middle - STEEPEST_PX, 1), min(middle + STEEPEST_PX, len(profile) - 2)
-    top = -1
-    for k in range(first, last + 1):
-        slopes[k] = abs(profile[k + 1] - profile[k - 1])
-        if np.isfinite(slopes[k]) and (top < 0 or slopes[k] > slopes[top]):
-            top = k
-    if not middle - STEEPEST_PX < top < middle + STEEPEST_PX:
-        return np.nan
-    bend = slopes[top - 1] - 2.0 * slopes[top] + slopes[top + 1]
-    shift = 0.5 * (slopes[top - 1] - slopes[top + 1]) / bend if bend < 0.0 else 0.0
-    return top + min(max(shift, -0.5), 0.5)
-
-
-@njit(cache=True, nogil=True)
-def search_outline(grey, pixels, normals, brightness, reach, side, least_contrast, tolerance):
-    """Signed distances (p,) along the normals to the step that is most likely the outline, or NaN.
-
-    A candidate's inner side must be as bright as it was within the tolerance, where that is known (not NaN). Its score
-    is the contrast of both sides, times how well they look as the object did, and halves at half the reach: what is
-    near is more likely the outline. Shading inside shifts the largest contrast; the outline is where it is steepest.
-
-    Parameters
-    ----------
-    pixels, normals : (p, 2).
-    brightness : (p, 2, side) of the object inside and outside, from one pixel off on.
-    reach, side : how far to search, and the pixels averaged on each side.
-    least_contrast, tolerance : grey levels, and relative to the inner side's.
-    """
-    length = 2 * (reach + side) + 1
-    profile, slopes = np.empty(length), np.empty(length)
-    steps, result = np.empty(2 * reach + 1), np.full(len(pixels), np.nan)
-    for j in range(len(pixels)):
-        inside, outside = np.mean(brightness[j, 0, 1:]), np.mean(brightness[j, 1, 1:])
-        if not np.isfinite(pixels[j, 0]) or abs(inside - outside) < least_contrast:
-            continue
-        _read_profile(grey, pixels[j, 0], pixels[j, 1], normals[j, 0], normals[j, 1], -reach - side, profile)
-        best = _best_step(profile, brightness[j], inside, reach, side, least_contrast, tolerance, steps)
-        if best >= 0:
-            result[j] = _steepest(profile, best + side, slopes) - side - reach
     return result
