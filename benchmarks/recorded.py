@@ -140,8 +140,8 @@ BENCHMARKS = {
         f"{NOISE}; the place of the plain seal in the map has no error but the map's",
         6,
         "The plain seal is one grey; the printed one is also hidden by a disc, `hidden_share` of it. Beside texture "
-        "that is exact to a twentieth of a pixel the outline counts for little: it neither spoils nor helps. How a smooth surface's edge "
-        "is placed was chosen with the plain seal in sight.",
+        "that is exact to a twentieth of a pixel the outline counts for little: it neither spoils nor helps. How a "
+        "smooth surface's edge is placed was chosen with the plain seal in sight.",
     ),
     "cross_model": Benchmark(
         "Tracking",
@@ -223,8 +223,8 @@ BENCHMARKS = {
         "python benchmarks/registration_seeds.py",
         "simulated: exact pose and scale",
         "other in each scan",
-        about="Thresholds were chosen with the first seven scans in sight; how much of the outline has to be shown also "
-        "with the three after these.",
+        about="Thresholds were chosen with the first seven scans in sight; how much of the outline has to be shown "
+        "also with the three after these.",
     ),
     "rendered_desks": Benchmark(
         "Registration",
