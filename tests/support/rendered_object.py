@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.registration.scene import MapPoints, View
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object
 from morph_dslam.render.model_view import looking_at
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
@@ -121,3 +124,20 @@ def _camera_from_world(camera_from_object, world):
     rotation = camera_from_object.rotation @ world.rotation.T
     translation = world.scale * camera_from_object.translation - rotation @ world.translation
     return RigidTransform(rotation, translation)
+
+
+def shaded(views, world_from_object):
+    """The views with images of a wedge whose faces have a grey each, before a grey table, with a little noise."""
+    nodes, triangles, _ = wedge()
+    rng, corners = np.random.default_rng(0), nodes[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    grey = 120.0 + normals @ [60.0, 35.0, 20.0]
+    images = []
+    for view in views:
+        local = camera_from_object(view, world_from_object).apply(nodes)
+        drawn = rasterise(CAMERA.project(local), local[:, 2], triangles, CAMERA.height, CAMERA.width, closed=True)
+        image = np.where(drawn.covered, grey[drawn.triangle_ids], 200.0) + rng.normal(0.0, 2.0, drawn.covered.shape)
+        image = cv2.GaussianBlur(image, (0, 0), 0.7)
+        images.append(replace(view, normalized=normalize_contrast(image.clip(0, 255).astype(np.uint8))))
+    return images

@@ -15,9 +15,8 @@ from morph_dslam.registration.edges import EdgeImages, Sighting
 from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.scene import View, camera_from_object
 from morph_dslam.registration.view_registration import EdgeSearch, GuessedPose, Hints
-from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.patches import normalize_contrast
-from tests.support.rendered_object import CAMERA, scanned, wedge
+from tests.support.rendered_object import CAMERA, scanned, shaded, wedge
 
 WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 NODES, TRIANGLES, _ = wedge()
@@ -47,18 +46,7 @@ def scaled(scan, scale):
 def scan():
     """A wedge whose faces have a grey each, before a grey table, with a little noise."""
     points, views = scanned(WORLD)
-    rng, corners = np.random.default_rng(0), NODES[TRIANGLES]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    grey = 120.0 + normals @ [60.0, 35.0, 20.0]
-    shaded = []
-    for view in views:
-        local = camera_from_object(view, WORLD).apply(NODES)
-        drawn = rasterise(CAMERA.project(local), local[:, 2], TRIANGLES, CAMERA.height, CAMERA.width, closed=True)
-        image = np.where(drawn.covered, grey[drawn.triangle_ids], 200.0) + rng.normal(0.0, 2.0, drawn.covered.shape)
-        image = cv2.GaussianBlur(image, (0, 0), 0.7)
-        shaded.append(replace(view, normalized=normalize_contrast(image.clip(0, 255).astype(np.uint8))))
-    return points, shaded
+    return points, shaded(views, WORLD)
 
 
 def test_edges_lay_an_object_from_near(scan):

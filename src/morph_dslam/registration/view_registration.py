@@ -24,6 +24,7 @@ from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, S
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.mesh_edges import MeshEdges
+from morph_dslam.registration.other_views import gains_in
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
@@ -38,6 +39,10 @@ FEWEST_AGREEING, AGREEING_SHARE = 6, 0.6
 UNIT_ERROR = 0.12
 #: Log likelihood for a point that agrees, and against one that does not.
 AGREES = 0.5
+#: What other keyframes say counts by this, as steps of the search carry an object some way off in them.
+BY_OTHERS = 0.5
+#: Edges of smaller objects, pixels, count less in proportion: their points are too near each other to be independent.
+INDEPENDENT_PX = 200.0
 #: Hypotheses of each ranking fitted to their own keyframe.
 N_BY_ALL, N_BY_TELLING = 60, 300
 #: Of these, the best fitted to few keyframes, keyframes for it, and those of more.
@@ -377,13 +382,18 @@ class EdgeSearch:
 
     def _agreeing(self, found: InView, view: View) -> list[SimilarityTransform]:
         """The best of the hypotheses by their edges and by the points of the map in their outline."""
-        unit, agreeing, off_planes, others = found.units(view, self._dense[0], self._off_planes)
+        unit, agreeing, off_planes, apart = found.units(view, self._dense[0], self._off_planes)
         possible = agreeing >= FEWEST_AGREEING
         if self.metric:
             possible &= np.abs(np.log(np.maximum(unit, 1e-300))) < UNIT_ERROR
-        mostly = possible & (agreeing >= AGREEING_SHARE * (agreeing + others))
-        by_all = np.where(mostly, found.gains + AGREES * (agreeing - 2 * others), -np.inf)
-        by_telling = np.where(possible, found.gains + AGREES * (off_planes - others), -np.inf)
+        rows = np.flatnonzero(possible)
+        others = [other for other in spread_views(self._views, FEW_VIEWS) if other is not view]
+        gains = found.gains.copy()
+        gains[rows] += BY_OTHERS * gains_in(found, rows, unit[rows], view, others)
+        gains *= np.minimum(found.sizes / INDEPENDENT_PX, 1.0)
+        mostly = possible & (agreeing >= AGREEING_SHARE * (agreeing + apart))
+        by_all = np.where(mostly, gains + AGREES * (agreeing - 2 * apart), -np.inf)
+        by_telling = np.where(possible, gains + AGREES * (off_planes - apart), -np.inf)
         # A large plane fits any flat face, so that its points may mislead; but the object's faces may be planes.
         best = [*_diverse(found, by_all, N_BY_ALL, N_BY_ALL), *_diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)]
         return [placed(found.pose(k), view, float(unit[k]), self.metric) for k in dict.fromkeys(best)]

@@ -61,6 +61,8 @@ class EdgeDrawings:
     rotations : (s, 3, 3) camera from object.
     offsets : (s, N_POINTS, 2) from the object's middle, in parts of its size times focal length over distance.
     normals : (s, N_POINTS) direction across the edge in the image, rad.
+    points : (s, N_POINTS, 3) object frame, from its middle, metres.
+    tangents : (s, N_POINTS, 3) along the edge, as far as it is seen across the sight line.
     depths : (s, d, d) how far its surface is behind its middle, in its size; inf where it is not. The drawing reaches
         `SEEN` times its size to all sides.
     """
@@ -68,6 +70,8 @@ class EdgeDrawings:
     rotations: Array
     offsets: Array
     normals: Array
+    points: Array
+    tangents: Array
     depths: Array
 
     @classmethod
@@ -83,7 +87,7 @@ class EdgeDrawings:
         small = Camera(DEPTH_PX, DEPTH_PX, short, short, middle, middle)
         centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
         rng = np.random.default_rng(0)
-        rotations, offsets, normals, depths = [], [], [], []
+        rotations, offsets, normals, points, tangents, depths = [], [], [], [], [], []
         for sight in sights:
             rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [sight])[0].as_matrix()
             pose = RigidTransform(rotation, np.array([0.0, 0.0, DRAWN_AT * edges.size]) - rotation @ centre)
@@ -92,12 +96,15 @@ class EdgeDrawings:
             if len(chosen) == N_POINTS:
                 rotations.append(rotation)
                 offsets.append((seen.pixels[chosen] - 127.5) / 100.0)
-                normals.append(np.arctan2(seen.normals[chosen, 1], seen.normals[chosen, 0]))
+                across = seen.normals[chosen]
+                normals.append(np.arctan2(across[:, 1], across[:, 0]))
+                points.append(seen.points[chosen] - centre)
+                tangents.append(np.column_stack([-across[:, 1], across[:, 0]]) @ rotation[:2])
                 depths.append(edges.depth(pose, small) / edges.size - DRAWN_AT)
-        return cls(np.array(rotations), np.array(offsets), np.array(normals), np.array(depths))
+        return cls(*(np.array(each) for each in (rotations, offsets, normals, points, tangents, depths)))
 
 
-def edge_gains(view: View) -> NDArray[np.int8]:
+def edge_gains(view: View, tolerance: float = TOLERANCE) -> NDArray[np.int8]:
     """By how much an edge of each direction speaks for the object at each pixel (`N_DIRECTIONS`, h / 2, w / 2).
 
     Over `PER_GAIN`, the log of the likelihood of what is seen there, an edge of that direction or none, on an edge of
@@ -112,7 +119,7 @@ def edge_gains(view: View) -> NDArray[np.int8]:
         apart = np.abs((angle - np.pi * k / N_DIRECTIONS + np.pi / 2) % np.pi - np.pi / 2)
         is_edge = (strength > LEAST_EDGE) & (apart < 0.75 * np.pi / N_DIRECTIONS)
         away = cv2.distanceTransform((~is_edge).astype(np.uint8), cv2.DIST_L2, 3)
-        hit = (away <= TOLERANCE).astype(np.float32)
+        hit = (away <= tolerance).astype(np.float32)
         chance = np.clip(cv2.blur(hit, (WINDOW, WINDOW)), 0.05, 0.95)
         shown = np.maximum(SHOWN, chance)
         gains.append(np.where(hit > 0, np.log(shown / chance), np.log((1.0 - shown) / (1.0 - chance))))
@@ -234,12 +241,21 @@ class InView:
 
     def pose(self, k: int) -> RigidTransform:
         """The camera_from_object, metres, of one of them."""
-        ray = self.camera.rays(self.places[k : k + 1])[0]
-        distance = self.diameter * self.camera.fx / self.sizes[k]
-        about = Rotation.from_rotvec([0.0, 0.0, 2.0 * np.pi * self.turns[k] / N_TURNS])
-        towards = Rotation.align_vectors([ray / np.linalg.norm(ray)], [[0.0, 0.0, 1.0]])[0]
-        rotation = (towards * about).as_matrix() @ self.drawings.rotations[self.sides[k]]
-        return RigidTransform(rotation, distance * ray - rotation @ self.centre)
+        (rotation,), (middle,) = self.poses(np.array([k]))
+        return RigidTransform(rotation, middle - rotation @ self.centre)
+
+    def poses(self, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Rotations (k, 3, 3), camera_from_object, and places (k, 3) of the object's middle in the camera, metres."""
+        rays = self.camera.rays(self.places[rows])
+        x, y, z = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).T
+        # The shortest turn from the optical axis to the ray.
+        share, zeros = 1.0 / (1.0 + z), np.zeros(len(x))
+        towards = np.stack([1.0 - share * x * x, -share * x * y, x, -share * x * y, 1.0 - share * y * y, y, -x, -y, z])
+        angles = 2.0 * np.pi * self.turns[rows] / N_TURNS
+        c, s = np.cos(angles), np.sin(angles)
+        about = np.stack([c, -s, zeros, s, c, zeros, zeros, zeros, zeros + 1.0])
+        turns = towards.T.reshape(-1, 3, 3) @ about.T.reshape(-1, 3, 3) @ self.drawings.rotations[self.sides[rows]]
+        return turns, (self.diameter * self.camera.fx / self.sizes[rows])[:, None] * rays
 
     def units(
         self, view: View, points: MapPoints, telling: NDArray[np.bool_]
