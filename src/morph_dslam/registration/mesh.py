@@ -74,7 +74,7 @@ AMBIGUOUS = 0.8
 #: does not put there, as far as the keyframes agree on it; where landmarks have it, by the outline alone. A little less
 #: does where images on its surface show its shape: texture hides edges; but a wall and a table have the shape of many
 #: objects, in some size.
-CONFIRMED, OUTLINE_SHOWN, OUTLINE_OF_TEXTURED = 10.0, 0.5, 0.42
+CONFIRMED, OUTLINE_SHOWN, OUTLINE_OF_TEXTURED = 10.0, 0.5, 0.45
 #: Below this score edges that no images confirm are not enough: the points of the map are searched as well.
 SURE = 20.0
 #: Images on the object that show its shape are believed before its edges, unless they lose more than this of the score;
@@ -208,7 +208,7 @@ def register_mesh(
         return _by_edges(places, search, points, views, bool(hints.clicks))
     score = 100.0 * places[0].rank if places else 0.0
     by_edges = cache(partial(_by_edges, places, search, points, views))
-    is_clear = score >= CONFIRMED and _clear([place.rank for place in places])
+    is_clear = score >= CONFIRMED and by_edges().runner_up <= AMBIGUOUS * score
     if is_clear and (score >= SURE or by_edges().rms_px is not None):
         return by_edges()
     try:
@@ -226,11 +226,6 @@ def register_mesh(
     informative = 0.0 < there.edges.chance < TELLING_CHANCE and there.edges.gain < AGAINST
     contradicts = informative and there.edges.is_below(AGAINST if found.shape_shown else OUTLINE_SHOWN)
     return replace(found, edges=there.edges) if contradicts else found
-
-
-def _clear(ranks: list[float]) -> bool:
-    """Whether the first of the places, the best first, is much better than the next one."""
-    return max([0.0, *ranks[1:]]) <= AMBIGUOUS * ranks[0]
 
 
 def _by_edges(
@@ -273,7 +268,11 @@ def _by_edges(
     if not (aligned.shows_its_shape or is_exact):
         return replace(found, rms_px=aligned.rms_px)
     outline = outline_fit(adjusted.world_from_object, nodes, triangles, asked, search.camera)
-    return replace(adjusted, edges=there.edges, outline=outline)
+    # In texture, edges have the object in several sizes about the place that images give.
+    rivals = tuple(
+        rival for rival in found.rivals if not search.same(rival.world_from_object, adjusted.world_from_object)
+    )
+    return replace(adjusted, edges=there.edges, outline=outline, rivals=rivals)
 
 
 def _by_points(search: EdgeSearch, points: MapPoints, views: Sequence[View], progress: bool) -> MeshRegistration:

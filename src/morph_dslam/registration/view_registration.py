@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +46,10 @@ BY_OTHERS = 0.5
 INDEPENDENT_PX = 200.0
 #: Hypotheses of each ranking fitted to their own keyframe.
 N_BY_ALL, N_BY_TELLING = 60, 300
-#: Of these, the best fitted to few keyframes, keyframes for it, and those of more.
-N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 40, 4, 8, 8
+#: Of these, those fitted to few keyframes from where they were found, as fitting them to their own may lead them away.
+N_AS_FOUND = 20
+#: Of the fitted ones, the best fitted to few keyframes, keyframes for it, and those of more.
+N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 30, 4, 8, 8
 #: Edges say nothing where chance puts so much of an outline on some.
 TELLING_CHANCE = 0.5
 #: No other keyframe is searched if a place has such a rank, after the first one and later, and the next place less
@@ -216,7 +219,7 @@ class EdgeSearch:
 
         chosen: list[SimilarityTransform] = []
         for _, place in sorted(on_all_cores(rough, starts), key=lambda pair: -pair[0]):
-            if len(chosen) < N_FINE and not any(self._same(place, other) for other in chosen):
+            if len(chosen) < N_FINE and not any(self.same(place, other) for other in chosen):
                 chosen.append(place)
         return self._distinct(on_all_cores(lambda place: self._fitted(place, self._images(place), FINE), chosen))
 
@@ -231,11 +234,11 @@ class EdgeSearch:
         """Those that are not the same place as a better one, the best first."""
         kept: list[EdgeRegistration] = []
         for each in sorted(found, key=lambda each: -each.rank):
-            if not any(self._same(each.place, other.place) for other in kept):
+            if not any(self.same(each.place, other.place) for other in kept):
                 kept.append(each)
         return kept
 
-    def _same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
+    def same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
         """Whether two places are one as a camera sees them; the map's unit may differ."""
         view = self._views[len(self._views) // 2]
         one, other = (camera_from_object(view, place) for place in (a, b))
@@ -346,7 +349,7 @@ class EdgeSearch:
         return PointsOnSurface(self._dense[0], self.surface, len(self._dense[1]))
 
     def _in_keyframe(self, view: View) -> list[SimilarityTransform]:
-        """Where a keyframe may show the object, and the map has points that agree, the best first."""
+        """Where a keyframe may show the object, and the map has points that agree."""
         hints, camera = self._hints, self.camera
         if not np.ptp(view.normalized) > 0:
             return []
@@ -366,7 +369,7 @@ class EdgeSearch:
             return []
         found = hypotheses(self._drawings, self.edges, view, camera, sizes, places)
         starts = [] if found is None else self._agreeing(found, view)
-        return self._best_in(view, starts, QUICK)
+        return self._best_in(view, starts, QUICK) + starts[:N_AS_FOUND]
 
     def _best_in(
         self, view: View, starts: Sequence[SimilarityTransform], reaches: Sequence[float]
@@ -381,7 +384,7 @@ class EdgeSearch:
         return [place for _, place in sorted(on_all_cores(ranked, starts), key=lambda pair: -pair[0])[:N_FITTED]]
 
     def _agreeing(self, found: InView, view: View) -> list[SimilarityTransform]:
-        """The best of the hypotheses by their edges and by the points of the map in their outline."""
+        """The best of the hypotheses by their edges and by the points of the map in their outline, the best first."""
         unit, agreeing, off_planes, apart = found.units(view, self._dense[0], self._off_planes)
         possible = agreeing >= FEWEST_AGREEING
         if self.metric:
@@ -395,7 +398,8 @@ class EdgeSearch:
         by_all = np.where(mostly, gains + AGREES * (agreeing - 2 * apart), -np.inf)
         by_telling = np.where(possible, gains + AGREES * (off_planes - apart), -np.inf)
         # A large plane fits any flat face, so that its points may mislead; but the object's faces may be planes.
-        best = [*_diverse(found, by_all, N_BY_ALL, N_BY_ALL), *_diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)]
+        both = _diverse(found, by_all, N_BY_ALL, N_BY_ALL), _diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)
+        best = [k for pair in zip_longest(*both) for k in pair if k is not None]
         return [placed(found.pose(k), view, float(unit[k]), self.metric) for k in dict.fromkeys(best)]
 
     def _where_said(self) -> list[SimilarityTransform]:
