@@ -114,6 +114,15 @@ def test_wrong_frame_ranges(text, refused):
     assert "is not a range of frames such as 9-100" in refused(*command, f"--range={text}")
 
 
+@pytest.fixture
+def interruptible():
+    """As in a terminal; what a shell runs in the background ignores Ctrl-C, and so do the tests there."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_waits_until_a_module_is_imported(number, capsys, tmp_path, monkeypatch):
     """Compiled modules turn it into errors of their own, as this one does."""
@@ -140,6 +149,7 @@ def test_an_interrupt_waits_until_a_module_is_imported(number, capsys, tmp_path,
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_is_not_lost_where_errors_cannot_be_raised(number, capsys):
     """As where an object is deleted; Cython code does the same."""
