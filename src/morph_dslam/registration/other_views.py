@@ -23,7 +23,7 @@ LOOSE = 4.0
 
 
 def gains_in(found: InView, rows: NDArray[np.int64], units: Array, view: View, others: Sequence[View]) -> Array:
-    """Sums (k,) of what speaks for the edges of hypotheses in other keyframes, as `InView.gains` in their own.
+    """Sums (k,) of what speaks for the edges of hypotheses in some keyframes, as `InView.gains` in their own.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def gains_in(found: InView, rows: NDArray[np.int64], units: Array, view: View, o
     rows : (k,) which of them.
     units : (k,) of the map per metre, by each.
     view : theirs.
-    others : other keyframes.
+    others : keyframes to ask.
     """
     rotations, centres = found.poses(rows)
     camera, drawings = found.camera, found.drawings

@@ -40,8 +40,8 @@ FEWEST_AGREEING, AGREEING_SHARE = 6, 0.6
 UNIT_ERROR = 0.12
 #: Log likelihood for a point that agrees, and against one that does not.
 AGREES = 0.5
-#: What other keyframes say counts by this, as steps of the search carry an object some way off in them.
-BY_OTHERS = 0.5
+#: What several keyframes say counts by this, as steps of the search carry an object some way off in them.
+BY_SEVERAL = 0.5
 #: Edges of smaller objects, pixels, count less in proportion: their points are too near each other to be independent.
 INDEPENDENT_PX = 200.0
 #: Hypotheses of each ranking fitted to their own keyframe.
@@ -390,9 +390,8 @@ class EdgeSearch:
         if self.metric:
             possible &= np.abs(np.log(np.maximum(unit, 1e-300))) < UNIT_ERROR
         rows = np.flatnonzero(possible)
-        others = [other for other in spread_views(self._views, FEW_VIEWS) if other is not view]
         gains = found.gains.copy()
-        gains[rows] += BY_OTHERS * gains_in(found, rows, unit[rows], view, others)
+        gains[rows] += BY_SEVERAL * gains_in(found, rows, unit[rows], view, spread_views(self._views, FEW_VIEWS))
         gains *= np.minimum(found.sizes / INDEPENDENT_PX, 1.0)
         mostly = possible & (agreeing >= AGREEING_SHARE * (agreeing + apart))
         by_all = np.where(mostly, gains + AGREES * (agreeing - 2 * apart), -np.inf)
