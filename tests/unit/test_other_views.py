@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.registration.mesh_edges import MeshEdges
-from morph_dslam.registration.other_views import LOOSE, added_gains, gains_in
+from morph_dslam.registration.other_views import LOOSE, AskedView, added_gains, gains_in
 from morph_dslam.registration.scene import camera_from_object
 from morph_dslam.registration.view_search import N_POINTS, N_TURNS, PER_GAIN, EdgeDrawings, InView, edge_gains
 from tests.support.rendered_object import CAMERA, scanned, shaded, wedge
@@ -82,7 +82,7 @@ def test_behind_the_camera_and_beside_the_image_is_nothing(views):
 
 def test_of_hypotheses_in_one_keyframe_the_others_want_the_right_unit_and_attitude(views):
     """One that is right to the steps of the search, with the true unit, and with others; and turned upside down."""
-    view, others = views[3], [views[0], views[5], views[7]]
+    view, others = views[3], [AskedView.of(views[k]) for k in (0, 5, 7)]
     pose = camera_from_object(view, WORLD)
     sides, turns = (x.ravel() for x in np.meshgrid(np.arange(len(DRAWINGS.rotations)), np.arange(N_TURNS)))
     (place,), size = CAMERA.project(pose.apply(CENTRE)[None]), EDGES.size * CAMERA.fx / pose.apply(CENTRE)[2]

@@ -132,21 +132,21 @@ def seen_from(pose: RigidTransform, camera: Camera) -> tuple[Array, Array, Array
 
 
 @njit(cache=True, nogil=True)
-def _dot(a, b):
+def dot(a, b):
     """Scalar product of two vectors (3,), without a call of the linear algebra."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True, nogil=True)
-def _turned(rotation, vector):
+def turn_vector(rotation, vector):
     """A vector (3,) after a rotation."""
-    return _dot(rotation[0], vector), _dot(rotation[1], vector), _dot(rotation[2], vector)
+    return dot(rotation[0], vector), dot(rotation[1], vector), dot(rotation[2], vector)
 
 
 @njit(cache=True, nogil=True)
-def _moved(rotation, translation, point):
+def move_point(rotation, translation, point):
     """A point (3,) after a rotation and a translation."""
-    x, y, z = _turned(rotation, point)
+    x, y, z = turn_vector(rotation, point)
     return x + translation[0], y + translation[1], z + translation[2]
 
 
@@ -162,7 +162,7 @@ def drawn_depth(edges, rotation, translation, intrinsics, width, height, shrink)
     least_u = least_v = np.inf
     most_u = most_v = -np.inf
     for n in range(len(edges.nodes)):
-        x, y, z = _moved(rotation, translation, edges.nodes[n])
+        x, y, z = move_point(rotation, translation, edges.nodes[n])
         if not z > 0.0:
             return nothing, 0, 0
         u, v = (fx * x / z + cx + 0.5) / shrink - 0.5, (fy * y / z + cy + 0.5) / shrink - 0.5
@@ -193,13 +193,13 @@ def see_edges(edges, rotation, translation, intrinsics, width, height):
     count, k = len(edges.points), 0
     rows, turned = np.empty(count, np.int64), np.empty(count, np.bool_)
     local, pixels, normals = np.empty((count, 3)), np.empty((count, 2)), np.empty((count, 2))
-    eye = _turned(-rotation.T, translation)
+    eye = turn_vector(-rotation.T, translation)
     for p in range(count):
-        first = _dot(edges.sides[0, p], eye) > edges.away[0, p]
-        second = _dot(edges.sides[1, p], eye) > edges.away[1, p]
+        first = dot(edges.sides[0, p], eye) > edges.away[0, p]
+        second = dot(edges.sides[1, p], eye) > edges.away[1, p]
         if first == second and not (edges.sharp[p] and first):
             continue
-        x, y, z = _moved(rotation, translation, edges.points[p])
+        x, y, z = move_point(rotation, translation, edges.points[p])
         if not z > 0.0:
             continue
         u, v = fx * x / z + cx, fy * y / z + cy
@@ -231,14 +231,14 @@ def _is_ahead(depth, left, top, width, height, u, v, nearest):
 def _across(edges, p, rotation, fx, fy, local, normal):
     """The direction across an edge in the image. Where a smooth surface turns away, its own normal is across."""
     if edges.sharp[p]:
-        x, y, z = _turned(rotation, edges.along[p])
+        x, y, z = turn_vector(rotation, edges.along[p])
         ahead_u = fx * (x - local[0] / local[2] * z) / local[2]
         ahead_v = fy * (y - local[1] / local[2] * z) / local[2]
         normal[0], normal[1] = -ahead_v, ahead_u
     else:
         one, other = edges.sides[0, p], edges.sides[1, p]
-        normal[0] = _dot(rotation[0], one) + _dot(rotation[0], other)
-        normal[1] = _dot(rotation[1], one) + _dot(rotation[1], other)
+        normal[0] = dot(rotation[0], one) + dot(rotation[0], other)
+        normal[1] = dot(rotation[1], one) + dot(rotation[1], other)
     length = max(np.sqrt(normal[0] ** 2 + normal[1] ** 2), 1e-300)
     normal[0], normal[1] = normal[0] / length, normal[1] / length
 

@@ -1,18 +1,20 @@
-"""What other keyframes say of hypotheses that one keyframe gave.
+"""What several keyframes say of hypotheses that one keyframe gave.
 
 A hypothesis of one keyframe has a unit of the map by the points in its outline, and so a place in the map: its edges
-are expected somewhere in every other keyframe. What looks like the object from one side by chance does so from no
-other.
+are expected somewhere in every keyframe. What looks like the object from one side by chance seldom does from another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.registration.mesh_edges import dot, move_point, turn_vector
 from morph_dslam.registration.scene import View
 from morph_dslam.registration.view_search import HALF, N_DIRECTIONS, N_PARTS, PER_GAIN, InView, edge_gains
 from morph_dslam.threads import on_all_cores
@@ -22,7 +24,25 @@ Array = NDArray[np.float64]
 LOOSE = 4.0
 
 
-def gains_in(found: InView, rows: NDArray[np.int64], units: Array, view: View, others: Sequence[View]) -> Array:
+@dataclass(frozen=True)
+class AskedView:
+    """A keyframe that is asked for edges.
+
+    Attributes
+    ----------
+    camera_from_world : its pose.
+    gains : (d, h / 2, w / 2) of `edge_gains`.
+    """
+
+    camera_from_world: RigidTransform
+    gains: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, view: View) -> AskedView:
+        return cls(view.camera_from_world, edge_gains(view, LOOSE))
+
+
+def gains_in(found: InView, rows: NDArray[np.int64], units: Array, view: View, asked: Sequence[AskedView]) -> Array:
     """Sums (k,) of what speaks for the edges of hypotheses in some keyframes, as `InView.gains` in their own.
 
     Parameters
@@ -31,22 +51,18 @@ def gains_in(found: InView, rows: NDArray[np.int64], units: Array, view: View, o
     rows : (k,) which of them.
     units : (k,) of the map per metre, by each.
     view : theirs.
-    others : keyframes to ask.
+    asked : keyframes.
     """
     rotations, centres = found.poses(rows)
-    camera, drawings = found.camera, found.drawings
+    sights, points, tangents = found.drawings.rotations[:, 2], found.drawings.points, found.drawings.tangents
     total = np.zeros(len(rows))
-    for other in others:
-        between = other.camera_from_world @ view.camera_from_world.inverse
-        turned = between.rotation @ rotations
+    for each in asked:
+        between = each.camera_from_world @ view.camera_from_world.inverse
+        turns = np.ascontiguousarray(between.rotation @ rotations)
         middles = centres @ between.rotation.T + between.translation / units[:, None]
-        gains = edge_gains(other, LOOSE)
 
-        def of_part(part: NDArray[np.int64], turned=turned, middles=middles, gains=gains) -> Array:
-            return added_gains(
-                gains, np.ascontiguousarray(turned[part]), middles[part], drawings.rotations[:, 2], drawings.points,
-                drawings.tangents, camera.intrinsics,
-            )  # fmt: skip
+        def of_part(part: NDArray[np.int64], gains=each.gains, turns=turns, middles=middles) -> Array:
+            return added_gains(gains, turns[part], middles[part], sights, points, tangents, found.camera.intrinsics)
 
         parts = np.array_split(np.arange(len(rows)), N_PARTS)
         total += np.concatenate(on_all_cores(of_part, parts)) / PER_GAIN
@@ -70,26 +86,22 @@ def added_gains(gains, rotations, middles, sights, points, tangents, intrinsics)
         turn, middle = rotations[h], middles[h]
         if not middle[2] > 0.0:
             continue
-        sight = turn.T @ middle
+        sight = turn_vector(turn.T, middle)
         side, most = 0, -np.inf
         for s in range(len(sights)):
-            along = sights[s, 0] * sight[0] + sights[s, 1] * sight[1] + sights[s, 2] * sight[2]
+            along = dot(sights[s], sight)
             if along > most:
                 side, most = s, along
         total = 0
         for p in range(points.shape[1]):
-            a, b = points[side, p], tangents[side, p]
-            x = turn[0, 0] * a[0] + turn[0, 1] * a[1] + turn[0, 2] * a[2] + middle[0]
-            y = turn[1, 0] * a[0] + turn[1, 1] * a[1] + turn[1, 2] * a[2] + middle[1]
-            z = turn[2, 0] * a[0] + turn[2, 1] * a[1] + turn[2, 2] * a[2] + middle[2]
+            x, y, z = move_point(turn, middle, points[side, p])
             if not z > 0.0:
                 continue
             column = int(np.rint((fx * x / z + cx + 0.5) / HALF - 0.5))
             row = int(np.rint((fy * y / z + cy + 0.5) / HALF - 0.5))
             if not (0 <= column < width and 0 <= row < height):
                 continue
-            u = turn[0, 0] * b[0] + turn[0, 1] * b[1] + turn[0, 2] * b[2]
-            v = turn[1, 0] * b[0] + turn[1, 1] * b[1] + turn[1, 2] * b[2]
+            u, v, _ = turn_vector(turn, tangents[side, p])
             direction = int(np.rint(np.arctan2(u, -v) / np.pi * N_DIRECTIONS)) % N_DIRECTIONS
             total += gains[direction, row, column]
         result[h] = total

@@ -25,7 +25,7 @@ from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, S
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.mesh_edges import MeshEdges
-from morph_dslam.registration.other_views import gains_in
+from morph_dslam.registration.other_views import AskedView, gains_in
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
@@ -345,6 +345,11 @@ class EdgeSearch:
         return EdgeDrawings.of(self.edges)
 
     @cached_property
+    def _asked(self) -> list[AskedView]:
+        """Keyframes that are asked of every hypothesis."""
+        return [AskedView.of(view) for view in spread_views(self._views, FEW_VIEWS)]
+
+    @cached_property
     def _on_it(self) -> PointsOnSurface:
         return PointsOnSurface(self._dense[0], self.surface, len(self._dense[1]))
 
@@ -391,7 +396,7 @@ class EdgeSearch:
             possible &= np.abs(np.log(np.maximum(unit, 1e-300))) < UNIT_ERROR
         rows = np.flatnonzero(possible)
         gains = found.gains.copy()
-        gains[rows] += BY_SEVERAL * gains_in(found, rows, unit[rows], view, spread_views(self._views, FEW_VIEWS))
+        gains[rows] += BY_SEVERAL * gains_in(found, rows, unit[rows], view, self._asked)
         gains *= np.minimum(found.sizes / INDEPENDENT_PX, 1.0)
         mostly = possible & (agreeing >= AGREEING_SHARE * (agreeing + apart))
         by_all = np.where(mostly, gains + AGREES * (agreeing - 2 * apart), -np.inf)

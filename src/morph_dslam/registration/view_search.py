@@ -62,7 +62,6 @@ class EdgeDrawings:
     offsets : (s, N_POINTS, 2) from the object's middle, in parts of its size times focal length over distance.
     normals : (s, N_POINTS) direction across the edge in the image, rad.
     points : (s, N_POINTS, 3) object frame, from its middle, metres.
-    tangents : (s, N_POINTS, 3) along the edge, as far as it is seen across the sight line.
     depths : (s, d, d) how far its surface is behind its middle, in its size; inf where it is not. The drawing reaches
         `SEEN` times its size to all sides.
     """
@@ -71,8 +70,13 @@ class EdgeDrawings:
     offsets: Array
     normals: Array
     points: Array
-    tangents: Array
     depths: Array
+
+    @property
+    def tangents(self) -> Array:
+        """Along the edges (s, N_POINTS, 3), object frame, as far as they are seen across the sight line."""
+        along = np.stack([-np.sin(self.normals), np.cos(self.normals)], axis=2)
+        return np.asarray(along @ self.rotations[:, :2])
 
     @classmethod
     def of(cls, edges: MeshEdges) -> EdgeDrawings:
@@ -87,7 +91,7 @@ class EdgeDrawings:
         small = Camera(DEPTH_PX, DEPTH_PX, short, short, middle, middle)
         centre = 0.5 * (edges.nodes.min(axis=0) + edges.nodes.max(axis=0))
         rng = np.random.default_rng(0)
-        rotations, offsets, normals, points, tangents, depths = [], [], [], [], [], []
+        rotations, offsets, normals, points, depths = [], [], [], [], []
         for sight in sights:
             rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [sight])[0].as_matrix()
             pose = RigidTransform(rotation, np.array([0.0, 0.0, DRAWN_AT * edges.size]) - rotation @ centre)
@@ -96,12 +100,10 @@ class EdgeDrawings:
             if len(chosen) == N_POINTS:
                 rotations.append(rotation)
                 offsets.append((seen.pixels[chosen] - 127.5) / 100.0)
-                across = seen.normals[chosen]
-                normals.append(np.arctan2(across[:, 1], across[:, 0]))
+                normals.append(np.arctan2(seen.normals[chosen, 1], seen.normals[chosen, 0]))
                 points.append(seen.points[chosen] - centre)
-                tangents.append(np.column_stack([-across[:, 1], across[:, 0]]) @ rotation[:2])
                 depths.append(edges.depth(pose, small) / edges.size - DRAWN_AT)
-        return cls(*(np.array(each) for each in (rotations, offsets, normals, points, tangents, depths)))
+        return cls(*(np.array(each) for each in (rotations, offsets, normals, points, depths)))
 
 
 def edge_gains(view: View, tolerance: float = TOLERANCE) -> NDArray[np.int8]:
