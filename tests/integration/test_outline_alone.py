@@ -10,10 +10,11 @@ import morph_dslam as md
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.registration.registration import Registration
+from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, colours, mean_error
 from tests.support.turning_block import turning_block
 
@@ -96,23 +97,51 @@ def test_what_is_before_the_object_and_known_does_not_count(model):
         assert mean_error(model, result.estimate.state, state(time)) < 1e-3
 
 
-def test_what_moves_nothing_of_the_outline_is_unobservable():
-    """Of a ball that keeps its shape, both parameters; where it is its outline tells."""
-    rows, columns = np.mgrid[0:480, 0:640]
+ROWS, COLUMNS = np.mgrid[0:480, 0:640]
+BALL_AT = State(np.zeros(2), RigidTransform(UPRIGHT, np.array([0.0, 0.0, 0.4])))
+#: Of a ball's disc, pixels: a plane touches the ball all around it.
+RADIUS_PX = 528.0 * 0.05 / np.sqrt(0.4**2 - 0.05**2)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Of 50 mm, that keeps its shape."""
     model = turning_block(32)[0]
     nodes = 0.05 * model.nodes / np.linalg.norm(model.nodes, axis=1)[:, None]
     still = model.displacement.with_modes(np.zeros_like(model.displacement.modes))
-    ball = md.ReducedModel("ball", nodes, model.triangles, model.parameters, still)
-    there = State(np.zeros(2), RigidTransform(UPRIGHT, np.array([0.0, 0.0, 0.4])))
-    radius = 528.0 * 0.05 / np.sqrt(0.4**2 - 0.05**2)
-    disc = 180.0 - 90.0 * np.clip(radius - np.hypot(columns - 320.0, rows - 240.0) + 0.5, 0.0, 1.0)
+    return md.ReducedModel("ball", nodes, model.triangles, model.parameters, still)
+
+
+def disc(radius):
+    """A dark disc (h, w) of this radius, pixels, one or by pixel."""
+    return 180.0 - 90.0 * np.clip(radius - np.hypot(COLUMNS - 320.0, ROWS - 240.0) + 0.5, 0.0, 1.0)
+
+
+def test_what_moves_nothing_of_the_outline_is_unobservable(ball):
+    """Of a ball that keeps its shape, both parameters; where it is its outline tells."""
     options = md.TrackerOptions(use_outline=True)
-    tracker = md.Tracker(ball, CAMERA, Registration(ball, there), options, reference=colours(disc))
-    result = tracker.track(colours(disc + np.random.default_rng(0).standard_normal(disc.shape)))
+    tracker = md.Tracker(ball, CAMERA, Registration(ball, BALL_AT), options, reference=colours(disc(RADIUS_PX)))
+    result = tracker.track(colours(disc(RADIUS_PX) + np.random.default_rng(0).standard_normal(ROWS.shape)))
     assert result.estimate is not None
     np.testing.assert_allclose(result.estimate.state.camera_from_object.translation, [0.0, 0.0, 0.4], atol=0.5e-3)
     assert np.all(result.estimate.pose_std[3:] < 0.5e-3)
     assert np.all(result.estimate.parameter_std > 0.5 * (ball.upper - ball.lower))
+
+
+def test_an_outline_that_errs_as_a_whole_does_not_outweigh_the_map(ball):
+    """A ball's disc is a pixel too small, which is 6 mm of distance, and bent by one more; the map knows it to 1 mm."""
+    rng, sight = np.random.default_rng(3), np.zeros((6, 6))
+    sight[5, 5] = 1e-3
+    known = PosePrior(BALL_AT.camera_from_object, 1e-8 * np.eye(6), sight)
+    options, angles = md.TrackerOptions(use_outline=True), np.arctan2(ROWS - 240.0, COLUMNS - 320.0)
+    tracker = md.Tracker(ball, CAMERA, Registration(ball, BALL_AT), options, reference=colours(disc(RADIUS_PX)))
+    off = []
+    for _ in range(12):
+        bent = disc(RADIUS_PX - 1.0 + np.cos(9.0 * angles + rng.uniform(0.0, 6.3)))
+        result = tracker.track(colours(bent + rng.standard_normal(bent.shape)), CameraLocalization(known))
+        assert result.estimate is not None
+        off.append(abs(result.estimate.state.camera_from_object.translation[2] - 0.4))
+    assert max(off) < 3e-3
 
 
 def test_several_cameras_need_texture(model):

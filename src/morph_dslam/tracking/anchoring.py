@@ -149,6 +149,8 @@ def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:
 
 #: Spread of residuals, pixels, before any frame has shown one, and the least that is believed.
 FIRST_SIGMA_PX, LEAST_SIGMA_PX = 0.5, 0.1
+#: Variance of an outline's point without texture, squared pixels, times how many of them count as one, likewise.
+FIRST_OUTLINE_PX2 = 5.0
 #: How much more a pose counts that is to be held.
 HELD = 1e6
 
@@ -169,8 +171,10 @@ class Anchoring:
         self._estimator, self.reference, self._options = estimator, reference, options
         self._d = len(estimator.model.parameters)
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-        self._squared_px, self._n_other = reference.redundancy * FIRST_SIGMA_PX**2, 0
-        self.has_moved = False
+        self._squared_px = reference.redundancy * FIRST_SIGMA_PX**2
+        if reference.outline_alone:
+            self._squared_px = FIRST_OUTLINE_PX2
+        self.has_moved, self._n_other = False, 0
         #: What the points of a frame's state said last: outline and filter mostly leave that as it is.
         self._judged: tuple[PosePrior, State, bool] | None = None
 

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 LEARNING_RATE = 0.1
 #: Errors of points within so many pixels of each other are compared.
 NEAR_PX = 40.0
+#: The errors of an outline are alike over this length before any frame has shown it, pixels.
+FIRST_LENGTH_PX = 8.0
 #: The outline is known no better than by this, pixels: where a rounded edge turns away is no line.
 LEAST_SPREAD_PX = 0.1
 #: Standard deviations beyond which a point does not agree, and the least such limit, pixels.
@@ -55,7 +57,7 @@ class ErrorComponent:
 
     def __init__(self) -> None:
         self.variance, self.redundancy = np.nan, 1.0
-        self._alike, self._apart = 0.0, NEAR_PX
+        self._alike, self._apart = float(np.exp(-NEAR_PX / FIRST_LENGTH_PX)), NEAR_PX
 
     def learn(self, pixels: Array, residuals: Array, variance: float) -> None:
         """Take in a frame.
