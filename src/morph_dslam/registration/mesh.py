@@ -176,6 +176,7 @@ def register_mesh(
     progress: bool = False,
     hints: Hints = NO_HINTS,
     claimed: Claimed | None = None,
+    most_keyframes: int | None = None,
 ) -> MeshRegistration:
     """Find an undeformed object in a map.
 
@@ -190,13 +191,14 @@ def register_mesh(
     progress : whether to show a progress bar.
     hints : what is known of where the object is.
     claimed : takes points on other objects out of a map.
+    most_keyframes : so many are searched for edges at most; all by default.
 
     Raises
     ------
     RegistrationError
         If the object is not found, or a hint names what is not there.
     """
-    search = EdgeSearch(nodes, triangles, points, views, camera, metric, hints, claimed)
+    search = EdgeSearch(nodes, triangles, points, views, camera, metric, hints, claimed, most_keyframes)
     places = search.search()
     if hints != NO_HINTS:
         if not places:
@@ -434,7 +436,7 @@ def register_in_unit(
         if not metric or hints != NO_HINTS:
             raise
         try:
-            found = register_mesh(nodes, triangles, points, views, camera, False, progress, NO_HINTS, claimed)
+            found = register_mesh(nodes, triangles, points, views, camera, False, progress, NO_HINTS, claimed, 1)
         except RegistrationError:
             raise error from None
         if found.ambiguous:

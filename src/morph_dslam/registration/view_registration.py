@@ -163,6 +163,7 @@ class EdgeSearch:
     metric : whether the map's unit is the metre.
     hints : what is known of where the object is.
     claimed : takes points on other objects out of a map.
+    most_keyframes : so many are searched at most; all by default.
     """
 
     def __init__(
@@ -175,10 +176,11 @@ class EdgeSearch:
         metric: bool,
         hints: Hints = NO_HINTS,
         claimed: Claimed | None = None,
+        most_keyframes: int | None = None,
     ) -> None:
         self.edges, self.surface = MeshEdges(nodes, triangles), Surface.of_mesh(nodes, triangles)
         self._points, self._views, self.camera, self.metric = points, list(views), camera, metric
-        self._hints, self._claimed = hints, claimed
+        self._hints, self._claimed, self._most_keyframes = hints, claimed, most_keyframes
         self.scale_std = METRIC_SCALE_STD if metric else np.inf
 
     def search(self) -> list[EdgeRegistration]:
@@ -207,7 +209,7 @@ class EdgeSearch:
         if self._hints.region is not None or not views:
             return views[:1]
         first = [len(views) // 2, len(views) // 6, 5 * len(views) // 6]
-        return [views[k] for k in dict.fromkeys([*first, *range(len(views))])]
+        return [views[k] for k in dict.fromkeys([*first, *range(len(views))])][: self._most_keyframes]
 
     def _fitted_from(self, starts: Sequence[SimilarityTransform]) -> list[EdgeRegistration]:
         """Distinct places near some others, the best first."""
