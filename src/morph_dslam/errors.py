@@ -50,6 +50,7 @@ class RegistrationFailure(StrEnum):
     PICTURE_NOT_SEEN = "picture_not_seen"
     GUESS_CONTRADICTED = "guess_contradicted"
     LANDMARKS_DO_NOT_FIT = "landmarks_do_not_fit"
+    FEW_CORNERS = "few_corners"
 
 
 class RegistrationError(MorphError):

@@ -8,9 +8,9 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.registration.registration import PosePrior, Registration
+from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
+from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
@@ -142,6 +142,21 @@ def test_an_outline_that_errs_as_a_whole_does_not_outweigh_the_map(ball):
         assert result.estimate is not None
         off.append(abs(result.estimate.state.camera_from_object.translation[2] - 0.4))
     assert max(off) < 3e-3
+
+
+def test_the_outline_is_used_unasked_where_a_map_has_an_object_without_texture(ball):
+    image, there = colours(disc(RADIUS_PX)), BALL_AT.camera_from_object
+    place = MapRegistration(SimilarityTransform(1.0, there.rotation, there.translation), np.zeros(3), 1e-6 * np.eye(7))
+    known = Registration(ball, BALL_AT, map_registration=place)
+    result = md.Tracker(ball, CAMERA, known, reference=image).track(image)
+    assert result.by_outline
+    assert result.estimate is not None
+    np.testing.assert_allclose(result.estimate.state.camera_from_object.translation, there.translation, atol=0.5e-3)
+    flat = colours(np.full(ROWS.shape, 128.0))
+    for free, options in ((Registration(ball, BALL_AT), None), (known, md.TrackerOptions(pose="free"))):
+        with pytest.raises(RegistrationError, match="--outline") as caught:
+            md.Tracker(ball, CAMERA, free, options, reference=flat)
+        assert caught.value.reason is RegistrationFailure.FEW_CORNERS
 
 
 def test_several_cameras_need_texture(model):

@@ -47,7 +47,7 @@ class TrackerOptions:
         off than this share of its size, and than so many standard deviations, in so many frames on end.
     look_every : a hidden or doubted object is looked for elsewhere in every so many frames.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from. An object
-        with too little texture is followed by it alone.
+        with too little texture is followed by it alone, and one in a map is so unasked.
     use_texture : whether texture counts where the outline does.
     use_depth : whether the depth images of frames that have them count too.
     modulus_std : standard deviation of a factor common to all moduli, a share; it counts in the reactions.

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from morph_dslam.errors import RegistrationError
-from morph_dslam.model import SurfacePoints
+from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.reduced_model import spread_over, triangle_normals
 from morph_dslam.render.rasteriser import Buffers, visible_points
@@ -180,6 +180,11 @@ class PosedImage:
 LEAST_BROADNESS = 0.1
 
 
+def fewest_points(model: ReducedModel) -> int:
+    """So many points at least determine pose and parameters, twice as well as needed."""
+    return 2 * (len(model.parameters) + 6)
+
+
 class ReferenceView:
     """A registered view of the object, or several of the same undeformed one.
 
@@ -199,6 +204,7 @@ class ReferenceView:
     pixels : (p, 2) where they are in the first view, hidden or not.
     outline : the object's contour, None where it is not used.
     outline_alone : whether the object shows too few corners to count, so that its outline is all there is.
+    n_textured : how many corners are on texture, not made by noise or shading.
     all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
@@ -365,22 +371,27 @@ class ReferenceView:
         model, camera = self._estimator.model, self._estimator.camera
         counts = per_pixel * np.array([np.count_nonzero(mask) for mask in masks])
         counts *= min(1.0, MOST_TIMES * self._options.n_points / max(counts.sum(), 1.0))
-        bound = []
+        bound, self.n_textured = [], 0
         for view, mesh, mask, count in zip(self._views, meshes, masks, counts, strict=True):
             corners = spread_corners(view.picture.normalized, mask, max(round(count), 1))
-            if self._options.use_outline:  # where there is no texture, noise makes corners too
-                corners = corners[weaker_slope(view.picture.normalized, corners, PATCH_WINDOW) > LEAST_SLOPE]
+            # Where there is no texture, noise makes corners too.
+            on_texture = weaker_slope(view.picture.normalized, corners, PATCH_WINDOW) > LEAST_SLOPE
+            self.n_textured += int(on_texture.sum())
+            if self._options.use_outline:
+                corners = corners[on_texture]
             surface, _ = bind_pixels(self.surface.model, camera, mesh, corners)
             bound.append(BoundPoints.from_surface(model, surface))
         found = sum(len(points) for points in bound)
-        needed = max(2 * (len(model.parameters) + 6), self._options.least_inliers)
+        fewest = fewest_points(model)
+        needed = max(fewest, self._options.least_inliers)
         if self._options.use_outline and (found < needed or not self._options.use_texture):
             none = SurfacePoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
             return [BoundPoints.from_surface(model, none) for _ in bound]
-        if found < 2 * (len(model.parameters) + 6):
+        if found < fewest:
             raise RegistrationError(
                 f"the object shows only {found} corners in the reference frame, too few to follow it: "
-                "take a sharper reference frame, give the object a printed texture, or use its outline"
+                "take a sharper reference frame, give the object a printed texture, or use its outline (--outline)",
+                RegistrationFailure.FEW_CORNERS,
             )
         return bound
 

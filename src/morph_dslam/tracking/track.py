@@ -422,7 +422,7 @@ def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results:
         "inputs": {name: str(path) for name, path in named.items() if path is not None},
         "reference_keyframes": part.reference_keyframes,
         "reference_refined_over_the_sequence": results.refined,
-        "outline_used": options.use_outline,
+        "outline_used": options.use_outline or any(result.by_outline for result in results.results),
         "depth_used": options.use_depth,
         "discrepancy_used": options.use_discrepancy,
         "unknown_loads_used": options.use_unknown_loads,

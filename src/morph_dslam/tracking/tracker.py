@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import TrackingError
+from morph_dslam.errors import RegistrationError, RegistrationFailure, TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
@@ -46,7 +46,7 @@ from morph_dslam.tracking.outcomes import (
     TrackingWarning,
 )
 from morph_dslam.tracking.patches import LEVELS, follow, normalize_contrast, zero_where_unknown
-from morph_dslam.tracking.reference import PosedImage, ReferenceView
+from morph_dslam.tracking.reference import PosedImage, ReferenceView, fewest_points
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.still import held
@@ -112,7 +112,7 @@ class Tracker:
     Raises
     ------
     RegistrationError
-        If the object shows too few corners in the reference frame, or its place in the scene has no covariance.
+        If a free object shows too few corners in the reference frame, or its place in the scene has no covariance.
     TrackingError
         If a per-sequence parameter, or one that walks, is not in the model.
     """
@@ -415,10 +415,10 @@ class Tracker:
 
     def _begin(self, image: Image) -> None:
         """Make the reference view."""
-        known, options = self._registration, self.options
+        known = self._registration
         keyframes = self._keyframes or KeyframeViews(error_factors_of(known.covariance, self.estimator.scale))
         first = PosedImage(image, known.state, keyframes.error_factors, self._seen, known.discrepancy)
-        view = ReferenceView(self.estimator, [first, *keyframes.views], options)
+        view, options = self._view_of([first, *keyframes.views]), self.options
         if options.pose == "still":
             # Where there are points, their places on the mesh have this error too: `SystematicErrors` adds both.
             factors = keyframes.error_factors if view.outline_alone else None
@@ -432,6 +432,19 @@ class Tracker:
         self._supported = np.ones(len(view.points), dtype=bool)
         self._last = self._velocity_base = self._start = known.state
         self._beyond = known.discrepancy
+
+    def _view_of(self, images: Sequence[PosedImage]) -> ReferenceView:
+        """The reference view; of an object that the map has, but that shows no texture, the outline is used unasked."""
+        in_map = self._registration.map_registration is not None and self.options.pose != "free"
+        try:
+            view = ReferenceView(self.estimator, images, self.options)
+            if self.options.use_outline or not in_map or view.n_textured >= fewest_points(self.model):
+                return view
+        except RegistrationError as error:
+            if not in_map or error.reason is not RegistrationFailure.FEW_CORNERS:
+                raise
+        self.options = replace(self.options, use_outline=True)
+        return ReferenceView(self.estimator, images, self.options)
 
     def _prepared(self, image: NDArray[np.uint8]) -> Image:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
