@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import Camera
 from morph_dslam.slam.least_squares_matching import measure_again, moved_along
-from morph_dslam.slam.local_map import gather, put_back
 from morph_dslam.slam.result import SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import GOOD, Followed, Keyframe, RigidMap
 
@@ -117,20 +115,6 @@ def test_points_that_two_views_alone_show_stay():
     rigid_map.template_keyframe[:], before = 1, rigid_map.keyframes[1].pixels.copy()
     measure_again(rigid_map, INTRINSICS)
     assert np.array_equal(rigid_map.keyframes[1].pixels, before)
-
-
-@pytest.mark.parametrize("again", [False, True])
-def test_a_mismatch_of_a_pixel_is_taken_out_once_all_points_are_measured_again(again):
-    rigid_map, rng, none = scene(), np.random.default_rng(4), np.empty(0, dtype=np.int64)
-    for keyframe in rigid_map.keyframes:
-        places = rigid_map.positions[keyframe.point_ids, :2]
-        keyframe.pixels = seen(keyframe.camera_from_world, places) + rng.normal(0.0, 0.05, places.shape)
-    rigid_map.keyframes[3].pixels[20, 0] += 1.0
-    problem = gather(rigid_map, Camera(WIDTH, HEIGHT, *INTRINSICS), np.arange(5), none, 20)
-    put_back(rigid_map, problem, problem.solve(), again)
-    assert (20 in rigid_map.keyframes[3].point_ids) is not again
-    n_kept = sum(len(keyframe.point_ids) for keyframe in rigid_map.keyframes)
-    assert n_kept > 0.97 * 5 * len(rigid_map.state)
 
 
 def test_frames_follow_the_newest_keyframe_that_shows_a_point():

@@ -148,8 +148,6 @@ class PointMaker:
 #: those beyond a smaller multiple before it count linearly; within bounds, in pixels. With bounds alone a few
 #: wrong points would bend an otherwise exact map.
 MISS_RATIO, LEAST_MISS_PX, MOST_MISS_PX = 6.0, 1.5, 4.0
-#: The same for what was measured again, each point from one view: what is far off there is mismatched.
-AGAIN_MISS_RATIO, AGAIN_LEAST_MISS_PX = 3.0, 0.2
 HUBER_RATIO, LEAST_HUBER_PX, MOST_HUBER_PX = 2.0, 0.2, 1.5
 TOLERANCE = 1e-4
 #: Keyframes that local bundle adjustment moves, and those that hold it.
@@ -273,17 +271,11 @@ def _take_over(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> 
         rigid_map.keyframes[k].camera_from_world = pose
 
 
-def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment, again: bool = False) -> None:
-    """Take over the adjusted poses and points, and take out what contradicts them.
-
-    Parameters
-    ----------
-    again : whether all points have just been measured again.
-    """
+def put_back(rigid_map: RigidMap, problem: MapProblem, result: Adjustment) -> None:
+    """Take over the adjusted poses and points, and take out what contradicts them."""
     _take_over(rigid_map, problem, result)
     usual = usual_error(problem.errors(result.camera_from_world, result.points))
-    ratio, least = (AGAIN_MISS_RATIO, AGAIN_LEAST_MISS_PX) if again else (MISS_RATIO, LEAST_MISS_PX)
-    most = min(max(ratio * usual, least), MOST_MISS_PX)
+    most = min(max(MISS_RATIO * usual, LEAST_MISS_PX), MOST_MISS_PX)
     _drop_misses(rigid_map, problem.free, problem.camera, most)
 
 

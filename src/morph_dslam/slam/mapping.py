@@ -191,16 +191,15 @@ class Mapper:
         yield
         yield from self._map.keyframes[number].describe(view.grey)
 
-    def adjust_all(self, iterations: int = 20, again: bool = False) -> None:
-        """Bundle adjustment of the whole map; ``again`` after all points have been measured again."""
-        self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations, again)
+    def adjust_all(self, iterations: int = 20) -> None:
+        """Bundle adjustment of the whole map."""
+        self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations)
 
     def complete(self) -> Moves:
         """Measure all points again, and adjust the whole map to that; by how much they moved in its keyframes."""
         self.adjust_all()
         moves = measure_again(self._map, self._intrinsics)
-        self.adjust_all(again=True)
-        self.adjust_all()  # without the mismatches that were taken out
+        self.adjust_all()
         return moves
 
     def _add_corners(self, number: int, view: FrameView) -> None:
@@ -220,9 +219,9 @@ class Mapper:
         window, holders = local_window(self._map)
         self._adjust(window, holders, LOCAL_ITERATIONS)
 
-    def _adjust(self, free: Indices, fixed: Indices, iterations: int, again: bool = False) -> None:
+    def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
         problem = gather(self._map, self._camera, free, fixed, iterations, self._hold_poses)
-        put_back(self._map, problem, problem.solve(), again)
+        put_back(self._map, problem, problem.solve())
 
     def _cull(self) -> None:
         """Take out map points that are hardly ever found where they should be."""
