@@ -181,7 +181,7 @@ LEAST_BROADNESS = 0.1
 
 
 def fewest_points(model: ReducedModel) -> int:
-    """So many points at least determine pose and parameters, twice as well as needed."""
+    """How many points there must be: two for each unknown of pose and parameters."""
     return 2 * (len(model.parameters) + 6)
 
 
