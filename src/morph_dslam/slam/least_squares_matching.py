@@ -28,11 +28,11 @@ Mask = NDArray[np.bool_]
 #: Half the side of a patch, pixels, and the standard deviation of the weights that fall off from its middle.
 HALF, WEIGHT_STD_PX = 10, 6.0
 #: A shorter step ends the search, pixels; steps at most; and how far a point may be from where it was followed to.
-LAST_STEP, MOST_STEPS, MOST_MOVE_PX = 0.02, 30, 3.0
+LAST_STEP, MOST_STEPS, MOST_MOVE_PX = 0.01, 20, 3.0
 #: What a match explains of the patch's contrast, as a correlation.
-LEAST_MATCH = 0.6
+LEAST_MATCH = 0.85
 #: A match whose place has a larger standard deviation, by what it does not explain, is none; pixels.
-MOST_STD_PX = 0.7
+MOST_STD_PX = 0.25
 #: Axes of a patch are stretched by at most this factor, and shrunk by as much.
 MOST_STRETCH = 3.0
 #: What could not be matched is taken out of a point that was matched in so many other keyframes.
