@@ -436,7 +436,10 @@ def register_in_unit(
         if not metric or hints != NO_HINTS:
             raise
         try:
-            found = register_mesh(nodes, triangles, points, views, camera, False, progress, NO_HINTS, claimed, 1)
+            # Whether it is there in another size is worth one keyframe's search, not as much as the first.
+            found = register_mesh(
+                nodes, triangles, points, views, camera, False, progress, claimed=claimed, most_keyframes=1
+            )
         except RegistrationError:
             raise error from None
         if found.ambiguous:

@@ -180,6 +180,11 @@ class PosedImage:
 LEAST_BROADNESS = 0.1
 
 
+def _on_texture(picture: Image, places: Array) -> NDArray[np.bool_]:
+    """Which places (p,) in a picture show texture: noise and shading make corners too."""
+    return weaker_slope(picture.normalized, places, PATCH_WINDOW) > LEAST_SLOPE
+
+
 def fewest_points(model: ReducedModel) -> int:
     """How many points there must be: two for each unknown of pose and parameters."""
     return 2 * (len(model.parameters) + 6)
@@ -204,7 +209,6 @@ class ReferenceView:
     pixels : (p, 2) where they are in the first view, hidden or not.
     outline : the object's contour, None where it is not used.
     outline_alone : whether the object shows too few corners to count, so that its outline is all there is.
-    n_textured : how many corners are on texture, not made by noise or shading.
     all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
@@ -272,6 +276,15 @@ class ReferenceView:
         """Finds the object by the view's features; these are taken when it is first asked for."""
         grey = self._views[0].picture.grey
         return Relocalizer(self._estimator, self.surface.model, grey, self._mask, self._mesh)
+
+    @property
+    def n_textured(self) -> int:
+        """How many of the points are on texture."""
+        camera, found = self._estimator.camera, 0
+        for view, part in zip(self._views, self.parts, strict=True):
+            places = camera.project(self.points.in_camera(part.state)[part.rows])
+            found += int(_on_texture(view.picture, places).sum())
+        return found
 
     @property
     def redundancy(self) -> float:
@@ -371,14 +384,11 @@ class ReferenceView:
         model, camera = self._estimator.model, self._estimator.camera
         counts = per_pixel * np.array([np.count_nonzero(mask) for mask in masks])
         counts *= min(1.0, MOST_TIMES * self._options.n_points / max(counts.sum(), 1.0))
-        bound, self.n_textured = [], 0
+        bound = []
         for view, mesh, mask, count in zip(self._views, meshes, masks, counts, strict=True):
             corners = spread_corners(view.picture.normalized, mask, max(round(count), 1))
-            # Where there is no texture, noise makes corners too.
-            on_texture = weaker_slope(view.picture.normalized, corners, PATCH_WINDOW) > LEAST_SLOPE
-            self.n_textured += int(on_texture.sum())
             if self._options.use_outline:
-                corners = corners[on_texture]
+                corners = corners[_on_texture(view.picture, corners)]
             surface, _ = bind_pixels(self.surface.model, camera, mesh, corners)
             bound.append(BoundPoints.from_surface(model, surface))
         found = sum(len(points) for points in bound)
