@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import ssl
 import struct
+import threading
 from contextlib import closing
 
-from websockets.sync.client import connect
+from websockets.asyncio.client import connect
 
 NUMBER = struct.Struct("<I")
 
@@ -35,6 +37,8 @@ def phone_session(server, address):
 class LivePage:
     """One WebSocket of a page; a context manager.
 
+    One thread alone touches the socket: OpenSSL does not let one send while another receives.
+
     Parameters
     ----------
     port : of the server.
@@ -56,23 +60,41 @@ class LivePage:
         self.facts = {}
 
     def __enter__(self):
-        self._socket = self._connecting.__enter__()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread.start()
+        try:
+            self._socket = self._wait(self._connecting.__aenter__())
+        except BaseException:
+            self._end()
+            raise
         return self
 
     def __exit__(self, *problem):
-        self._connecting.__exit__(*problem)
+        try:
+            self._wait(self._connecting.__aexit__(*problem))
+        finally:
+            self._end()
+
+    def _wait(self, coroutine, seconds=60.0):
+        return asyncio.run_coroutine_threadsafe(asyncio.wait_for(coroutine, seconds), self._loop).result()
+
+    def _end(self):
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
     def send(self, number, jpeg):
         """Send a frame."""
-        self._socket.send(NUMBER.pack(number) + jpeg)
+        self._wait(self._socket.send(NUMBER.pack(number) + jpeg))
 
     def say(self, message):
-        """Send something that is no frame."""
-        self._socket.send(message)
+        """Send something that is no frame; of a list, each as a part of one message."""
+        self._wait(self._socket.send(message))
 
     def receive(self, seconds=60.0):
         """The next message: (number, JPEG) of a picture, or None when facts came."""
-        message = self._socket.recv(seconds)
+        message = self._wait(self._socket.recv(), seconds)
         if isinstance(message, str):
             self.facts |= json.loads(message)
             return None
