@@ -151,12 +151,13 @@ def followed(folder: Path, run: Path, refine: bool, video: bool) -> Path:
     run_slam(frames, camera, run / "scan", last=SCAN_END, refine=terms, video=False, overwrite=True)
     if refine:
         camera = run / "scan" / "camera.yaml"
-    run_registration(run / "scan" / "map.h5", MODEL, camera, run / "place")
+    registered = run_registration(run / "scan" / "map.h5", MODEL, camera, run / "place")
     options = md.TrackOptions(
         frames=frames,
         model=MODEL,
         camera=camera,
         registration=run / "place" / "registration.json",
+        first=registered.frame,
         output=run / "run",
         video=video,
         overwrite=True,

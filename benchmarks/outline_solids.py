@@ -155,6 +155,7 @@ def printed(folder: Path, use_outline: bool) -> Errors:
             model=MODEL,
             camera=camera,
             registration=out / "registration.json",
+            first=seal.FROZEN_AT,
             output=run,
             tracker=md.TrackerOptions(use_outline=use_outline),
             video=False,

@@ -65,13 +65,14 @@ def tracked(seed: int, pose: str) -> NDArray[np.float64]:
     folder = recorded(seed)
     mapped(folder, False, last=seal.FROZEN_AT)
     camera, registration = folder / "recording" / "camera.yaml", folder / "registration"
-    run_registration(folder / "scan" / "map.h5", MODEL, camera, registration)
+    registered = run_registration(folder / "scan" / "map.h5", MODEL, camera, registration)
     summary = track(
         TrackOptions(
             frames=folder / "recording" / "frames",
             model=MODEL,
             camera=camera,
             registration=registration / "registration.json",
+            first=registered.frame,
             output=folder / "run",
             tracker=TrackerOptions(pose=pose),  # type: ignore[arg-type]
             video=False,

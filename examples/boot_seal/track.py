@@ -147,6 +147,7 @@ def run(arguments: argparse.Namespace) -> None:
             model=model,
             camera=camera,
             registration=output / "registration" / "registration.json",
+            first=registration.frame,  # the frames before are the scan
             map_path=output / "scan" / "map.h5",
             output=output / "run",
             overwrite=True,

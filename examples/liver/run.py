@@ -95,13 +95,15 @@ def track_from_map(folder: Path) -> dict:
     camera, frames = SEQUENCE / "camera.yaml", SEQUENCE / "frames"
     scan, place = OUTPUT / "scan", OUTPUT / "registration"
     run_slam(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True)
-    print(registration_line(run_registration(scan / "map.h5", MODEL, camera, place)))
+    registration = run_registration(scan / "map.h5", MODEL, camera, place)
+    print(registration_line(registration))
     return md.track(
         md.TrackOptions(
             frames=frames,
             model=MODEL,
             camera=camera,
             registration=place / "registration.json",
+            first=registration.frame,  # the frames before are the scan
             inner=(TUMOUR,),
             output=folder,
             overwrite=True,

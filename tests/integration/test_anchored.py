@@ -227,6 +227,19 @@ def test_the_outline_counts_where_only_keyframes_show_what_the_object_looks_like
         assert (tracker.last_measured.weights[len(tracker.reference.points) :] > 0.0).sum() > 50
 
 
+def test_a_recording_is_tracked_from_its_first_frame(recording, tmp_path):
+    """Not from the last keyframe of the scan, in which the object is registered."""
+    folder, truth = recording
+    run, _, placed = prepare(options(folder, tmp_path, first=None), ExitStack())
+    assert placed[0].frame > 0
+    assert run.first is None
+    summary = md.track(options(folder, tmp_path / "run", first=None, last=8, video=False))
+    assert summary["n_tracked"] == summary["n_frames"] == 9
+    found = load_run(tmp_path / "run")
+    assert found.frames.tolist() == list(range(9))
+    assert found.parameters[:, 0] == pytest.approx(truth["parameters"][:9, 0], abs=1e-3)
+
+
 def test_a_live_run_keeps_the_pace_and_everything_it_found(recording, tmp_path):
     folder, truth = recording
     summary = md.track(options(folder, tmp_path / "live", first=30, live=True, serve=0))

@@ -1,5 +1,6 @@
 """A camera and a support that stand still: one pose over the sequence, with a camera known badly."""
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -20,7 +21,8 @@ from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.session import Session
-from morph_dslam.tracking.still import StillProblem, fit_still
+from morph_dslam.tracking.still import StillFit, StillProblem, fit_still
+from morph_dslam.tracking.still_notices import FocalLengthEstimated, FocalLengthFarFromGiven, still_notices
 from morph_dslam.tracking.still_run import OpenedSurface
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import UPRIGHT, SheetFilm, mean_error, write_recording
@@ -116,6 +118,58 @@ def test_a_lens_that_is_not_known_is_estimated(recording, tmp_path):
     k1 = load_camera(tmp_path / "run" / "camera.yaml").distortion[0]
     assert k1 == pytest.approx(0.6, rel=0.2)
     assert errors(run).mean() < 2.5e-3  # nearly all of it along the sight line, as a longer lens would be
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    notices = {notice["kind"]: notice for notice in summary["notices"]}
+    assert notices["radial_term_estimated"]["value"] == pytest.approx(k1)
+    corner = np.array([[0.0, 0.0]])
+    moved_by = np.linalg.norm(CAMERA.undistort_pixels(corner) - corner)  # 0.6 of the true lens
+    assert notices["radial_term_estimated"]["corner_px"] == pytest.approx(moved_by * k1 / 0.6, rel=0.2)
+    assert "pose_away_from_landmarks" not in notices
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 3.0])
+def test_a_focal_length_is_the_same_from_wherever_it_starts(factor):
+    """Bent states show it from nearby; start and distance are off together, as they are where a lens is guessed."""
+    model, camera = bent_sheet_model(43, 31), Camera(640, 480, 700.0, 700.0, 320.0, 240.0)
+    pose = RigidTransform(POSE.rotation, np.array([0.005, -0.004, 0.5]))
+    rows, rng = np.arange(0, len(model.nodes), 7), np.random.default_rng(2)
+
+    def seen(parameters):
+        pixels = camera.project(pose.apply(model.positions(parameters)[rows]))
+        return pixels + 0.1 * rng.standard_normal(pixels.shape)
+
+    shapes = [State(2.0 * state(time).parameters, pose) for time in np.linspace(0.2, 1.0, 8)]
+    landmarks = Landmarks(model.nodes[rows[::9]], seen(model.default)[::9])
+    known = LandmarkTerm(bind_landmarks(model, landmarks.points), landmarks.pixels, 0.5)
+    frames = [Keyframe(seen(shape.parameters), np.ones(len(rows)), shape, 0.3) for shape in shapes]
+    stated = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    start = State(model.default, RigidTransform(pose.rotation, pose.translation * [1.0, 1.0, factor]))
+    known_shape = range(len(model.default))
+    problem = StillProblem(model, stated, start, seen(model.default), frames, known, (), known_shape, ("focal",))
+    found = fit_still(problem)
+    value, std = found.terms["focal"]
+    assert std < 0.03 * camera.fx
+    assert abs(value - camera.fx) < 3.0 * std
+    away_by = np.abs(found.state.camera_from_object.translation - pose.translation)
+    assert (away_by < 3.5 * np.sqrt(np.diag(found.covariance)[-3:])).all()
+    (notice,) = still_notices(found, known, stated)
+    assert isinstance(notice, FocalLengthEstimated)
+    assert isinstance(notice, FocalLengthFarFromGiven) == (factor == 3.0)
+
+
+def test_a_pose_away_from_the_landmarks_is_said():
+    model, camera = bent_sheet_model(43, 31), Camera(640, 480, 1500.0, 1500.0, 320.0, 240.0)
+    points = model.nodes[::97]
+    known = LandmarkTerm(bind_landmarks(model, points), camera.project(POSE.apply(points)), 1.0)
+    for shift, expected in ((0.0, 0), (2e-3, 0), (1e-2, 1)):
+        pose = RigidTransform(POSE.rotation, POSE.translation + [shift, 0.0, 0.0])
+        found = StillFit(State(model.default, pose), np.eye(len(model.default) + 6), camera, {})
+        notices = list(still_notices(found, known, camera))
+        assert len(notices) == expected
+        if expected:
+            # Parallel to the image, a shift is as large for all points at one depth.
+            assert notices[0].off_mm == pytest.approx(10.0, rel=0.1)
+            assert notices[0].off_px == pytest.approx(10.0 * 1.5 / 1.25, rel=0.1)
 
 
 def test_deformed_frames_decide_which_way_a_plane_is_tilted():

@@ -125,11 +125,23 @@ class StillProblem:
         return np.concatenate([lower[self._columns], -free]), np.concatenate([upper[self._columns], free])
 
     def state(self, unknowns: Array) -> State:
-        """The reference state."""
+        """The reference state; as far away in focal lengths as without the camera's terms.
+
+        A focal length and a distance that grow together change an image by little. With the distance in metres, steps
+        along that valley would have to follow its bend.
+        """
         step = np.zeros(len(self._scale))
         step[self._columns] = unknowns[: len(self._columns)]
         state = moved(self._start, step * self._scale)
-        return replace(state, parameters=np.clip(state.parameters, self._model.lower, self._model.upper))
+        pose = state.camera_from_object
+        pose = replace(pose, translation=pose.translation * np.array([1.0, 1.0, self._magnified(unknowns)]))
+        return State(np.clip(state.parameters, self._model.lower, self._model.upper), pose)
+
+    def _magnified(self, unknowns: Array) -> float:
+        """The focal length in focal lengths of the camera as given."""
+        if "focal" not in self._terms:
+            return 1.0
+        return float(np.exp(TERM_STD["focal"] * unknowns[len(self._columns) + self._terms.index("focal")]))
 
     def unknowns(self, state: State) -> Array:
         """Those of another reference state, with the camera as given."""
@@ -141,9 +153,8 @@ class StillProblem:
         """The camera with its terms, which are zero in ``unknowns`` where it is as given."""
         camera = self._camera
         by_name = dict(zip(self._terms, unknowns[len(self._columns) :], strict=True))
-        if "focal" in by_name:
-            factor = float(np.exp(TERM_STD["focal"] * by_name["focal"]))
-            camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+        factor = self._magnified(unknowns)
+        camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
         if "radial" in by_name:
             first, *others = camera.distortion or (0.0,) * 4
             change = float(TERM_STD["radial"] * by_name["radial"]) / corner_radius(camera) ** 2
@@ -213,9 +224,13 @@ class StillProblem:
         n, state, camera = len(self._columns), self.state(unknowns), self.camera(unknowns)
         values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
         inverse = (vectors / np.maximum(values, 1e-9 * max(values[-1], 1e-30))) @ vectors.T
-        covariance = np.zeros((len(self._scale),) * 2)
-        covariance[np.ix_(self._columns, self._columns)] = inverse[:n, :n]
-        covariance *= np.outer(self._scale, self._scale)
+        to_state = np.zeros((len(self._scale), self.size))
+        to_state[self._columns, np.arange(n)] = self._scale[self._columns]
+        if "focal" in self._terms:
+            to_state[-1, n - 1] *= self._magnified(unknowns)
+            by_focal = TERM_STD["focal"] * state.camera_from_object.translation[2]
+            to_state[-1, n + self._terms.index("focal")] = by_focal
+        covariance = to_state @ inverse @ to_state.T
         by_unknown = np.sqrt(np.diag(inverse)[n:])
         terms: dict[str, tuple[float, float]] = {}
         for term, std in zip(self._terms, by_unknown, strict=True):

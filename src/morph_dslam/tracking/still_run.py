@@ -21,6 +21,7 @@ from morph_dslam.tracking.placement import PlacedObject
 from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, landmark_deviation
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
+from morph_dslam.tracking.still_notices import still_notices
 from morph_dslam.tracking.tracker import Tracker
 
 #: Live, the pose is estimated anew after so many frames, and whenever there are twice as many.
@@ -50,13 +51,14 @@ def with_still_pose(
     assert isinstance(tracker, Tracker)
     names = [parameter.name for parameter in part.model.parameters]
     constant = [names.index(name) for name in part.options.per_sequence]
+    known = _state_term(part) if estimated else known_state(part)
     problem = StillProblem(
         part.model,
         part.camera,
         registration.state,
         tracker.reference.pixels,
         choose_keyframes(keyframes),
-        _state_term(part) if estimated else known_state(part),
+        known,
         constant,
         [n for n in range(len(names)) if part.object.at_rest and n not in constant],
         terms,
@@ -68,6 +70,7 @@ def with_still_pose(
     warnings = registration.warnings
     if found.decided:
         warnings = tuple(w for w in warnings if not (isinstance(w, Ambiguous) and w.why is Ambiguity.SHAPES))
+    warnings += tuple(still_notices(found, known, part.camera))
     registration = replace(
         registration, state=found.state, covariance=found.covariance, facts=facts, warnings=warnings, alternatives=()
     )

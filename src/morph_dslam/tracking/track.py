@@ -135,8 +135,11 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
 
 
 def _with_first_frame(run: TrackOptions, objects: Sequence[TrackedObject]) -> TrackOptions:
-    """A recording is tracked from the frame that an object is registered in, if nothing else is asked for."""
-    frames = [part.start.frame for part in objects if isinstance(part.start, Registration)]
+    """Without a map, a recording is tracked from the frame that an object is registered in, if nothing else is asked.
+
+    In a map an object is found in any frame, so all are tracked: the frame registered is the last one of the scan.
+    """
+    frames = [part.start.frame for part in objects if isinstance(part.start, Registration) and part.scene is None]
     return run if run.live or run.first is not None or not frames else replace(run, first=frames[0])
 
 
