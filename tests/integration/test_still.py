@@ -162,7 +162,7 @@ def test_a_pose_away_from_the_landmarks_is_said():
     points = model.nodes[::97]
     known = LandmarkTerm(bind_landmarks(model, points), camera.project(POSE.apply(points)), 1.0)
     for shift, expected in ((0.0, 0), (2e-3, 0), (1e-2, 1)):
-        pose = RigidTransform(POSE.rotation, POSE.translation + [shift, 0.0, 0.0])
+        pose = RigidTransform(POSE.rotation, POSE.translation + shift * np.array([1.0, 0.0, 0.0]))
         found = StillFit(State(model.default, pose), np.eye(len(model.default) + 6), camera, {})
         notices = list(still_notices(found, known, camera))
         assert len(notices) == expected

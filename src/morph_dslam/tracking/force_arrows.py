@@ -42,7 +42,10 @@ class ForceArrows:
         self._shortest = SHORTEST * largest
 
     def draw(self, image: NDArray[np.uint8], state: State, camera: Camera) -> NDArray[np.uint8]:
-        """The picture (h, w, 3) with an arrow from the middle of each support along its force, and its size."""
+        """The picture (h, w, 3) with an arrow along the force on each support that is in it, and its size beside it.
+
+        The arrow begins in the middle of the support, or ends there if it would leave the picture.
+        """
         drawn = image.copy()
         thickness = max(2, round(image.shape[0] / 240))
         for point, force in self._reactions.forces(state.parameters).values():
@@ -53,19 +56,33 @@ class ForceArrows:
             pixels = camera.project(ends)
             if not np.abs(pixels).max() < 1e5:
                 continue
+            is_in = _are_in(pixels, image.shape)
+            if not is_in[0]:
+                continue
+            if not is_in[1]:
+                before = 2.0 * pixels[0] - pixels[1]
+                pixels = np.array([before, pixels[0]]) if _are_in(before[None], image.shape)[0] else pixels
             start, tip = ((round(float(x)), round(float(y))) for x, y in pixels)
             for colour, width in ((EDGE, thickness + 2), (COLOUR, thickness)):
                 cv2.arrowedLine(drawn, start, tip, colour, width, cv2.LINE_AA, tipLength=0.2)
-            _write_beside(drawn, tip, f"{size:.3g} N")
+            _write_beside(drawn, pixels, f"{size:.3g} N", 2 * thickness)
         return drawn
 
 
-def _write_beside(image: NDArray[np.uint8], place: tuple[int, int], text: str) -> None:
-    """A label next to ``place`` (x, y), within the picture."""
+def _are_in(pixels: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pixels (n, 2) are in a picture."""
+    return np.asarray(((pixels >= 0.0) & (pixels < [shape[1], shape[0]])).all(axis=1))
+
+
+def _write_beside(image: NDArray[np.uint8], arrow: NDArray[np.float64], text: str, gap: int) -> None:
+    """A label beside the middle of an arrow (2, 2) and so many pixels from it, within the picture."""
     patch = text_patch(text, 0.42 * max(image.shape[0] / 480.0, 0.6))
-    height, width = patch.shape[:2]
-    if height > image.shape[0] or width > image.shape[1]:
+    size = np.array(patch.shape[1::-1])
+    if (size > image.shape[1::-1]).any():
         return
-    x = int(np.clip(place[0] + 6, 0, image.shape[1] - width))
-    y = int(np.clip(place[1] - height // 2, 0, image.shape[0] - height))
-    image[y : y + height, x : x + width] = patch
+    along = arrow[1] - arrow[0]
+    across = np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
+    across *= np.where(across[1] < 0.0, -1.0, 1.0)  # below, where there is a below
+    middle = arrow.mean(axis=0) + across * (gap + 0.5 * np.abs(across) @ size)
+    x, y = np.clip(np.round(middle - 0.5 * size), 0, image.shape[1::-1] - size).astype(int)
+    image[y : y + size[1], x : x + size[0]] = patch

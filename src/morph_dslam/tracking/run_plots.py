@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.reactions import VectorEstimate
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_results import RunResults
 
@@ -18,6 +20,8 @@ DPI = 110
 WIDTH, LEFT, RIGHT, BOTTOM, TOP, GAP = 9.0, 0.95, 0.15, 0.5, 0.15, 0.12
 #: Stages that are drawn with a colour of their own: as many as there are colours, with this part of the time.
 MOST_STAGES, LEAST_SHARE = 10, 0.005
+#: A moment that is a smaller share of the largest force times the object's size is rounding.
+ROUNDING = 1e-6
 
 
 def write_plots(folder: Path, run: RunResults) -> None:
@@ -75,21 +79,34 @@ def plot_confidence(path: Path, run: RunResults) -> None:
 
 
 def plot_reactions(path: Path, run: RunResults) -> None:
-    """Size of force and moment of each support, each with a band of two standard deviations."""
+    """Size of force and moment of each support, each with a band of two standard deviations.
+
+    A moment that is rounding beside what the forces give at the object's size is left out.
+    """
     reactions = run.reactions()
-    figure, all_axes = _rows(2 * len(reactions), 1.9)
-    for number, (name, frames) in enumerate(reactions.items()):
-        for kind, unit, scale, axes in (
-            ("force", "N", 1.0, all_axes[2 * number]),
-            ("moment", "N mm", 1e3, all_axes[2 * number + 1]),
-        ):
-            found = [getattr(reaction, kind, None) for reaction in frames]
-            both = scale * np.array([(np.nan, np.nan) if one is None else (one.size, one.size_std) for one in found])
-            top = 1.2 * float(np.nanmax(both[:, 0], initial=0.0)) or 1.0
-            _plot_band(axes, run, both[:, 0], both[:, 1], (0.0, top))
-            axes.set_ylabel(f"{kind} on {name} [{unit}]", fontsize=8)
+    sizes = {
+        kind: {name: _with_deviations([getattr(one, kind, None) for one in found]) for name, found in reactions.items()}
+        for kind in ("force", "moment")
+    }
+    largest = max(float(np.nanmax(both[:, 0], initial=0.0)) for both in sizes["force"].values())
+    least = ROUNDING * largest * float(np.linalg.norm(np.ptp(run.model.nodes, axis=0)))
+    rows = list[tuple[str, NDArray]]()
+    for name in reactions:
+        rows.append((f"force on {name} [N]", sizes["force"][name]))
+        if np.nanmax(sizes["moment"][name][:, 0], initial=0.0) > least:
+            rows.append((f"moment on {name} [N mm]", 1e3 * sizes["moment"][name]))
+    figure, all_axes = _rows(len(rows), 1.9)
+    for axes, (label, both) in zip(all_axes, rows, strict=True):
+        top = 1.2 * float(np.nanmax(both[:, 0], initial=0.0)) or 1.0
+        _plot_band(axes, run, both[:, 0], both[:, 1], (0.0, top))
+        axes.set_ylabel(label, fontsize=8)
     all_axes[0].legend(loc="upper left", fontsize=8)
     figure.savefig(path, dpi=DPI)
+
+
+def _with_deviations(found: Sequence[VectorEstimate | None]) -> NDArray:
+    """Sizes of vectors and their standard deviations (f, 2), NaN where there is none."""
+    return np.array([(np.nan, np.nan) if one is None else (one.size, one.size_std) for one in found])
 
 
 def _rows(count: int, height: float, top: float = TOP) -> tuple[Figure, NDArray]:
