@@ -82,7 +82,13 @@ def test_a_curve_by_a_parameter_is_read_between_its_points():
 
 @pytest.mark.parametrize(
     ("asked", "factor", "direction"),
-    [("clamp:x", 1.0, "-x"), ("clamp:+x", -1.0, "x"), ("clamp:y", 10.0, "y"), ("foot", 2.5, "x"), ("foot:z", 5.0, "z")],
+    [
+        ("clamp:x", 1.0, "-x"),
+        ("clamp:-x", 1.0, "-x"),
+        ("clamp:y", 10.0, "y"),
+        ("foot", 2.5, "x"),
+        ("foot:+z", 5.0, "z"),
+    ],
 )
 def test_support_and_direction_may_be_named(asked, factor, direction):
     figures = evaluate_force(pulled_run(), ForceCurve("frame", np.arange(10.0), pull(ARCHES)), reaction=asked)
@@ -94,7 +100,13 @@ def test_support_and_direction_may_be_named(asked, factor, direction):
     ("places", "asked", "message"),
     [
         (np.arange(10.0), "lid", "no force on 'lid'; it has those on clamp, foot"),
-        (np.arange(10.0), "clamp:z", "the same in all frames"),
+        (
+            np.arange(10.0),
+            "clamp:z",
+            "'clamp' along z is zero in this model; it acts along x: write --reaction clamp:x",
+        ),
+        (np.arange(10.0), "clamp:+x", "in direction x falls where .* write --reaction clamp:-x"),
+        (np.arange(10.0), "clamp:-y", "in direction -y falls where .* write --reaction clamp:\\+y"),
         (np.arange(10.0) + 8, None, "only 2 tracked frames lie on the curve"),
         (np.arange(10.0) % 5, None, "more than once"),
     ],
@@ -102,6 +114,28 @@ def test_support_and_direction_may_be_named(asked, factor, direction):
 def test_what_cannot_be_compared(places, asked, message):
     with pytest.raises(EvaluationError, match=message):
         evaluate_force(pulled_run(), ForceCurve("frame", places, pull(ARCHES)), reaction=asked)
+
+
+@pytest.mark.parametrize("of_clamp", [3.6e-15, 1e-7])
+def test_rounding_noise_of_a_support_is_no_force(of_clamp):
+    """Along y there is nothing but noise, which grows with the measured force: its fit would be perfect."""
+    noisy = replace(model(), reactions={"force_clamp": reaction([-5.0, 5.0 * of_clamp, 0.0])})
+    run = replace(pulled_run(), model=noisy)
+    with pytest.raises(EvaluationError, match="along y is zero in this model; it acts along x"):
+        evaluate_force(run, ForceCurve("frame", np.arange(10.0), pull(ARCHES)), reaction="clamp:y")
+
+
+def test_a_small_force_across_the_main_one_is_a_force():
+    small = replace(model(), reactions={"force_clamp": reaction([-5.0, 5e-3, 0.0])})
+    run = replace(pulled_run(), model=small)
+    figures = evaluate_force(run, ForceCurve("frame", np.arange(10.0), pull(ARCHES)), reaction="clamp:y")
+    assert figures["factor"] == pytest.approx(1e3)
+
+
+def test_a_force_that_does_not_change_gives_no_factor():
+    run = pulled_run(np.full(10, 0.02))
+    with pytest.raises(EvaluationError, match="the same in all frames"):
+        evaluate_force(run, ForceCurve("frame", np.arange(10.0), pull(ARCHES)))
 
 
 def test_a_model_without_reactions_says_so():
@@ -140,6 +174,7 @@ def test_the_command_writes_figures_a_plot_and_a_section_of_the_report(folder, c
     [
         ("frame,a_N,b_N\n1,2,3\n", "", "several columns of forces"),
         ("frame,a_N\n1,2\n", ":c_N", "no column 'c_N'"),
+        ("frame;a_N\n1;2\n", "", "separated by semicolons"),
         ("", "", "the first column is ''"),
         ("arch,force_N\n1,2\n", "", "arch_mm"),
         ("arch_deg,force_N\n1,2\n", "", "arch_mm"),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from scipy.stats import t
@@ -18,6 +21,7 @@ from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoin
 from morph_dslam.identification.report import identification_lines, summarise
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
+from tests.support.run_folders import write_run
 
 #: A plate of 1 m in the plane z = 0; it is shifted by (a, 0, 0) and (0, b c, 0), and turned about x by a small angle d.
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
@@ -205,8 +209,92 @@ def test_wrong_questions_are_refused() -> None:
         reaction_in_direction(model, "edge")
     with pytest.raises(EvaluationError, match="it has those on edge"):
         reaction_in_direction(model, "rim:x")
+    with pytest.raises(
+        EvaluationError, match="along x is zero in this model; it acts along z: write --reaction edge:z"
+    ):
+        reaction_in_direction(model, "edge:x")
     with pytest.raises(IdentificationError, match="give --run"):
         MeasuredForces(model, ForceCurve("frame", np.arange(5.0), np.ones(5)), reaction_in_direction(model, "edge:z"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "slope", "direction"),
+    [("edge:z", 80.0, "z"), ("edge:z", -80.0, "-z"), ("edge:+z", 80.0, "z"), ("edge:-z", -80.0, "-z")],
+)
+def test_a_force_follows_the_measured_one_or_has_the_sign_that_was_given(
+    asked: str, slope: float, direction: str
+) -> None:
+    """The model has 100 a newtons along z, whichever way the machine counts."""
+    model, places = plate(), np.linspace(0.0, 1.0, 25)
+    curve = ForceCurve("a", places, slope * places + 1.5, "pull_N")
+    figures = summarise(
+        identify(model, [MeasuredForces(model, curve, reaction_in_direction(model, asked))], moduli=True)
+    )
+    assert figures["parameters"][0]["value"] == pytest.approx(0.8, rel=1e-6)
+    assert figures["measurements"][0]["offset"] == pytest.approx(1.5, rel=1e-4)
+    assert (figures["measurements"][0]["support"], figures["measurements"][0]["direction"]) == ("edge", direction)
+    said = f"note: pull_N is compared with the force on 'edge' in direction {direction} of the object frame"
+    assert said in identification_lines(figures)
+
+
+@pytest.mark.parametrize(("asked", "slope", "other"), [("edge:+z", -80.0, "edge:-z"), ("edge:-z", 80.0, "edge:+z")])
+def test_the_wrong_sign_is_refused_with_the_other(asked: str, slope: float, other: str) -> None:
+    model, places = plate(), np.linspace(0.0, 1.0, 25)
+    forces = MeasuredForces(model, ForceCurve("a", places, slope * places), reaction_in_direction(model, asked))
+    with pytest.raises(EvaluationError) as refusal:
+        identify(model, [forces], moduli=True)
+    assert str(refusal.value).endswith(f"falls where the measured force grows: write --reaction {other}")
+
+
+def test_a_given_sign_holds_where_that_of_the_force_depends_on_what_is_identified() -> None:
+    """The force is a (2 b - 1) along z: at the default of b, 0.2, it falls with a, and at 0.9 it grows."""
+    model = plate()
+    low = replace(model.parameters[1], default=0.2)
+    functions = ParameterFunctions(np.zeros(3), np.ones(3), np.array([[0, 1, 0], [1, 1, 0]]), np.eye(2))
+    force = np.zeros((2, 1, 3))
+    force[:, 0, 2] = 0.5
+    swung = replace(
+        model,
+        parameters=(model.parameters[0], low, model.parameters[2]),
+        reactions={"force_edge": SeparatedField(force, functions)},
+    )
+    places = np.linspace(0.0, 1.0, 25)
+    forces = MeasuredForces(swung, ForceCurve("a", places, 0.8 * places), reaction_in_direction(swung, "edge:+z"))
+    assert identify(swung, [forces], ["b"])["b"].value == pytest.approx(0.9, abs=1e-6)
+
+
+STROKES = np.linspace(0.1, 0.9, 9)
+
+
+def write_run_of_plate(folder: Path) -> None:
+    """A run that found the shift of each frame, and that b is 0.5 in all of them."""
+    write_run(folder, frames=np.arange(9))
+    save_model(folder / "model.morph", plate())
+    with h5py.File(folder / "result.h5", "r+") as file:
+        del file["parameters"]
+        file["parameters"] = np.column_stack([STROKES, np.full(9, 0.5), np.full(9, 0.5)])
+    found = {"name": "b", "value": 0.5, "standard_deviation": 0.01, "observable": True}
+    (folder / "summary.json").write_text(json.dumps({"one_over_the_sequence": [found]}))
+
+
+@pytest.mark.parametrize(
+    ("title", "asked", "used"),
+    [("a_1", ["--moduli"], False), ("a_1", ["--moduli", "--parameter", "b"], True), ("frame", ["--moduli"], True)],
+)
+def test_a_run_that_changes_nothing_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], title: str, asked: list[str], used: bool
+) -> None:
+    """A run counts where forces are given by its frames, or where it found what is to be identified."""
+    write_run_of_plate(tmp_path / "run")
+    places = STROKES if title == "a_1" else np.arange(9)
+    rows = "".join(f"{place},{70 * a + 2}\n" for place, a in zip(places, STROKES, strict=True))
+    (tmp_path / "curve.csv").write_text(f"{title},force_N\n{rows}")
+    command = ["identify", str(tmp_path / "run" / "model.morph"), *asked, "--force", str(tmp_path / "curve.csv")]
+    command += ["--reaction", "edge:z", "--run", str(tmp_path / "run"), "-o", str(tmp_path / "out")]
+    assert cli.main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("note: --run changes nothing here") for line in lines) is not used
+    assert lines[-1].startswith(f"{FACTOR}=0.7 std=" if len(asked) == 1 else "b=0.5 std=")
 
 
 def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,7 +37,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="with --points and --pixels: frame whose pixels bind the points to the mesh",
     )
     command.add_argument(
-        "--reaction", metavar="SET[:AXIS]", help="with --force: the support, and x, -x, y ... of the object frame"
+        "--reaction", metavar="SET[:AXIS]", help="with --force: the support, and x, +x, -x, y ... of the object frame"
     )
 
 

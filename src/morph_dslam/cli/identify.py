@@ -29,7 +29,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "CURVE[:COLUMN]",
         file_and_column,
     )
-    add_repeated(command, "--reaction", "the support of each --force, and x, -x, y ... of the object frame", "SET:AXIS")
+    add_repeated(
+        command, "--reaction", "the support of each --force, and x, +x, -x, y ... of the object frame", "SET:AXIS"
+    )
     command.add_argument(
         "--run",
         dest="run_folder",
@@ -67,6 +69,12 @@ def run(arguments: argparse.Namespace) -> None:
     figures = write_identification(arguments.output, found)
     for line in identification_lines(figures):
         print(line)
+    by_frame = any(each.curve.against == "frame" for each in forces)
+    if tracked is not None and not by_frame and not set(prior) & set(arguments.parameter):
+        print(
+            "note: --run changes nothing here: no forces are given by frame, and no parameter to identify is one that "
+            "the run found for its whole sequence"
+        )
     print(f"wrote {arguments.output / 'identification.json'} and identification.png")
     print(last_line(figures))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,27 @@ from morph_dslam.units import FACTORS
 Array = NDArray[np.float64]
 #: Fewer comparisons determine no factor and offset with anything left over.
 LEAST = 3
+#: Changes of a force below this share of it are rounding.
+ROUNDING = 1e-9
+#: A component below this share of a support's largest force is rounding, as where models are built; in so many states
+#: beside the default.
+NEGLIGIBLE, SAMPLES = 1e-6, 32
+_GRAM, _POUND = 9.80665e-3, 4.4482216152605
+#: Newtons in each unit of a column of forces. Units of mass stand for weights here, as on the display of a load cell.
+FORCE_UNITS = {
+    **FACTORS["force"],
+    **{"uN": 1e-6, "MN": 1e6, "gf": _GRAM, "g": _GRAM, "kgf": 1e3 * _GRAM, "kg": 1e3 * _GRAM},
+    **{"lbf": _POUND, "lb": _POUND, "ozf": _POUND / 16.0, "oz": _POUND / 16.0},
+}
+#: Ends of names, in any case, that mean other units or spell one otherwise. Specimens have letters, so that one letter
+#: is no unit; nor are times and angles here, for force_min and force_rad are forces.
+_OTHER_UNITS = {
+    *(unit.lower() for unit in FORCE_UNITS if len(unit) > 1),
+    *(unit.lower() for name in FACTORS if name not in ("time", "angle") for unit in FACTORS[name] if len(unit) > 1),
+    *("dyn", "kp", "kip", "kips", "tf", "ton", "tons", "lbs", "grams", "pounds"),
+    *("nm", "nmm", "psi", "mv", "uv", "volt", "volts"),
+}
+_SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _REACTION = re.compile(r"(?P<support>.+?)(?::(?P<sign>[+-]?)(?P<axis>[xyz]))?")
 
 
@@ -57,34 +78,72 @@ class ReactionInDirection:
     field : the force, N.
     axis : 0, 1 or 2.
     sign : 1 or -1.
+    literal : whether the sign was given; otherwise `following` finds that in which the force grows with a measured one.
     """
 
     support: str
     field: SeparatedField
     axis: int
-    sign: float
+    sign: float = 1.0
+    literal: bool = True
 
     def __call__(self, mu: Array) -> float:
         """Newtons at parameters (d,), SI."""
         return self.sign * float(self.field.value(mu)[0, self.axis])
 
+    @property
+    def direction(self) -> str:
+        """As in reports: "x", "-z" and so on."""
+        return ("-" if self.sign < 0.0 else "") + "xyz"[self.axis]
+
+    def following(self, along: Array, measured: Array) -> ReactionInDirection:
+        """This reaction with its sign, if forces (e,) ``along`` its axis are compared with measured ones (e,)."""
+        return self if self.literal else replace(self, sign=-1.0 if _growth(along, measured) < 0.0 else 1.0)
+
+    def check_growth(self, modelled: Array, measured: Array) -> None:
+        """Raise EvaluationError if values (e,) of this reaction fall where the measured ones (e,) grow."""
+        if _growth(modelled, measured) < 0.0:
+            other = f"{self.support}:{'-+'[self.sign < 0.0]}{'xyz'[self.axis]}"
+            raise EvaluationError(
+                f"the model's force on '{self.support}' in direction {self.direction} falls where the measured force "
+                f"grows: write --reaction {other}"
+            )
+
+
+def _growth(modelled: Array, measured: Array) -> float:
+    """Positive if a force (e,) grows with the measured one (e,), negative if it falls, 0 where that is rounding."""
+    centred = measured - measured.mean()
+    together = float((modelled - modelled.mean()) @ centred)
+    size = float(np.linalg.norm(centred)) * float(np.abs(modelled).max()) * np.sqrt(len(modelled))
+    return together if abs(together) > ROUNDING * size else 0.0
+
 
 def reaction_in_direction(model: ReducedModel, text: str) -> ReactionInDirection:
-    """The reaction that "SET:x" or "SET:-x" names.
+    """The reaction that "SET:x", "SET:+x" or "SET:-x" names; without a sign, it follows the measured force.
 
     Raises
     ------
     EvaluationError
-        If the model has no force on this support, or the text no direction.
+        If the model has no force on this support or none in this direction, or the text names no direction.
     """
     asked = _REACTION.fullmatch(text)
     if asked is None or not asked["axis"]:
         raise EvaluationError(f"'{text}' names no direction: write SET:x, SET:-x, SET:y and so on, in the object frame")
-    fields = _force_fields(model)
-    if asked["support"] not in fields:
-        raise EvaluationError(f"the model has no force on '{asked['support']}'; it has those on {', '.join(fields)}")
-    sign = -1.0 if asked["sign"] == "-" else 1.0
-    return ReactionInDirection(asked["support"], fields[asked["support"]], "xyz".index(asked["axis"]), sign)
+    return _reaction(model, asked["support"], asked["axis"], asked["sign"])
+
+
+def _reaction(model: ReducedModel, support: str, axis: str, sign: str | None) -> ReactionInDirection:
+    """The force on a support along "x", "y" or "z" with sign "+", "-", or that of the measured force."""
+    field = _force_field(model, support)
+    largest = np.abs(_values(field, model.spread_parameters(SAMPLES))).max(axis=0)
+    at, most = "xyz".index(axis), int(largest.argmax())
+    # Unknown loads act along any axis, and the samples have none.
+    if not model.n_loads and largest[at] < NEGLIGIBLE * largest[most]:
+        raise EvaluationError(
+            f"the force on '{support}' along {axis} is zero in this model; it acts along {'xyz'[most]}: write "
+            f"--reaction {support}:{'xyz'[most]}"
+        )
+    return ReactionInDirection(support, field, at, -1.0 if sign == "-" else 1.0, literal=bool(sign))
 
 
 def load_curve(path: str | Path, model: ReducedModel, column: str | None = None) -> ForceCurve:
@@ -101,24 +160,67 @@ def load_curve(path: str | Path, model: ReducedModel, column: str | None = None)
     Raises
     ------
     EvaluationError
-        If the file is missing, a column is not known, or a value is no number.
+        If the file is missing, a column is not known, its unit is none of force, or a value is no number.
     """
-    rows = list(csv.reader(read_text(Path(path), "force curve", EvaluationError).splitlines()))
-    rows = [[cell.strip() for cell in row] for row in rows if any(cell.strip() for cell in row)]
-    first, *columns = rows[0] if rows else [""]
-    against, scale = _place(path, first, model)
-    if column is None and len(columns) == 1:
-        column = columns[0]
-    if column not in columns:
-        asked = "several columns of forces" if column is None and columns else f"no column '{column or 'force_N'}'"
-        raise EvaluationError(f"{path} has {asked}; name one of its own: {path}:COLUMN with {', '.join(columns)}")
-    at = 1 + columns.index(column)
-    values = np.array([_numbers(path, row, at) for row in rows[1:]]).reshape(-1, 2)
+    (_, titles), *rows = _table(path)
+    against, scale = _place(path, titles[0], model)
+    column = _column(path, titles, column)
+    newtons, at = _newtons(path, column), titles.index(column, 1)
+    for line, cells in rows:
+        if len(cells) > len(titles):
+            raise EvaluationError(
+                f"{path}, line {line}: {len(cells)} cells under {len(titles)} titles; write decimals with points"
+            )
+    values = np.array([_numbers(f"{path}, line {line}", cells, at) for line, cells in rows]).reshape(-1, 2)
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) < LEAST:
         raise EvaluationError(f"{path} has {len(values)} forces in column '{column}': give at least {LEAST}")
+    return ForceCurve(against, scale * values[:, 0], newtons * values[:, 1], column)
+
+
+def _table(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and cells of the lines that hold any, without empty cells at their ends; the titles are first."""
+    reader = csv.reader(read_text(Path(path), "force curve", EvaluationError).splitlines())
+    rows = [(reader.line_num, _filled(row)) for row in reader if any(cell.strip() for cell in row)] or [(1, [""])]
+    for separator, name in _SEPARATORS.items():
+        if separator in rows[0][1][0]:
+            raise EvaluationError(
+                f"{path} is separated by {name}: write commas between cells, and decimals with points"
+            )
+    return rows
+
+
+def _filled(row: Sequence[str]) -> list[str]:
+    """Its cells up to the last that is not empty."""
+    cells = [cell.strip() for cell in row]
+    return cells[: max(i for i, cell in enumerate(cells) if cell) + 1]
+
+
+def _column(path: str | Path, titles: Sequence[str], asked: str | None) -> str:
+    """The column of forces that is asked for, or the only one."""
+    columns = [title for title in titles[1:] if title]
+    if not columns:
+        raise EvaluationError(
+            f"{path} has no column of forces: give one beside '{titles[0]}', with its unit, as {titles[0]},force_N"
+        )
+    if asked is None and len(columns) == 1:
+        return columns[0]
+    if asked in columns:
+        return asked
+    wrong = "several columns of forces" if asked is None else f"no column '{asked}'"
+    others = f"; the others are {', '.join(columns[1:])}" if len(columns) > 1 else ""
+    raise EvaluationError(f"{path} has {wrong}; name one that it has, as {path}:{columns[0]}{others}")
+
+
+def _newtons(path: str | Path, column: str) -> float:
+    """Newtons in the unit that the name of a column ends in; 1 if it ends in none."""
     unit = column.rpartition("_")[2]
-    return ForceCurve(against, scale * values[:, 0], FACTORS["force"].get(unit, 1.0) * values[:, 1], column)
+    if unit not in FORCE_UNITS and unit.lower() in _OTHER_UNITS:
+        raise EvaluationError(
+            f"{path}: column '{column}' ends in '{unit}', which is no unit of force that is known: give one of "
+            f"{', '.join(FORCE_UNITS)}"
+        )
+    return FORCE_UNITS.get(unit, 1.0)
 
 
 def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, float]:
@@ -148,14 +250,14 @@ def parameter_columns(model: ReducedModel) -> str:
     return ", ".join(f"{parameter.name}_{parameter.unit}" for parameter in model.parameters)
 
 
-def _numbers(path: str | Path, row: Sequence[str], at: int) -> tuple[float, float]:
+def _numbers(where: str, row: Sequence[str], at: int) -> tuple[float, float]:
     """A place and a force of one line, NaN where the line has none."""
     try:
         found = float(row[0]), float((row[at] if at < len(row) else "") or "nan")
     except ValueError:
         found = np.inf, np.inf
     if np.isinf(found).any():
-        raise EvaluationError(f"{path}: '{','.join(row)}' is not a place on the curve and its forces, all numbers")
+        raise EvaluationError(f"{where}: '{','.join(row)}' is not a place on the curve and its forces, all numbers")
     return found
 
 
@@ -202,9 +304,15 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
 
     Parameters
     ----------
-    reaction : "SET", "SET:x" or "SET:-x": the support and the direction. Without a support that of the largest force
-        in the frames compared; without a direction that axis of the object along which its force is largest; without a
-        sign the one in which it grows with the measured force.
+    reaction : "SET", "SET:x", "SET:+x" or "SET:-x": the support and the direction. Without a support that of the
+        largest force in the frames compared; without a direction that axis of the object along which its force is
+        largest; without a sign the one in which it grows with the measured force.
+
+    Raises
+    ------
+    EvaluationError
+        If fewer than three tracked frames lie on the curve, or the model has no such force, one that does not change,
+        or one that falls where the measured force grows.
     """
     rows = np.flatnonzero(run.tracked)
     places, measured = _on_curve(run, curve, rows)
@@ -215,11 +323,11 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
             f"{_range(run, curve.against, curve.places)}, the run {_range(run, curve.against, places)}"
         )
     rows, left_out = rows[kept], run.frames[rows[~kept]]
-    support, direction, modelled = _modelled(run, rows, measured[kept], reaction)
-    factor, offset, deviation = _fit(modelled, measured[kept])
+    compared, modelled, size = _modelled(run, rows, measured[kept], reaction)
+    factor, offset, deviation = _fit(modelled, measured[kept], size)
     return ForceError(
-        support=support,
-        direction=direction,
+        support=compared.support,
+        direction=compared.direction,
         curve=curve,
         frames=run.frames[rows],
         places=places[kept],
@@ -247,7 +355,8 @@ def _on_curve(run: Run, curve: ForceCurve, rows: NDArray[np.integer]) -> tuple[A
     if (np.diff(known) <= 0.0).any():
         twice = _range(run, curve.against, known[1:][np.diff(known) <= 0.0][:1])
         raise EvaluationError(
-            f"the curve has {twice} more than once: give one branch of it, or the forces by frame (first column frame)"
+            f"the curve '{curve.name}' has {twice} more than once: give one branch of it, or the forces by frame "
+            "(first column frame)"
         )
     if curve.against == "frame":
         places = run.frames[rows].astype(float)
@@ -266,33 +375,42 @@ def _range(run: Run, against: str, places: Array) -> str:
     return f"{label} {' to '.join(f'{end:.6g}' for end in ends) or 'nowhere'}"
 
 
-def _modelled(run: Run, rows: NDArray[np.integer], measured: Array, reaction: str | None) -> tuple[str, str, Array]:
-    """The support, the direction, and the model's force (e,) in it."""
-    forces = _forces(run, rows)
-    asked = _REACTION.fullmatch(reaction) if reaction is not None else None
-    support = max(forces, key=lambda name: float(np.abs(forces[name]).max())) if asked is None else asked["support"]
-    if support not in forces:
-        raise EvaluationError(
-            f"the model has no force on '{support}'; it has those on {', '.join(forces)}: give --reaction SET, or "
-            "SET:x, SET:-x and so on"
-        )
-    force = forces[support]
-    axis = asked["axis"] if asked is not None and asked["axis"] else "xyz"[int(np.abs(force).max(axis=0).argmax())]
-    along = force[:, "xyz".index(axis)]
-    sign = asked["sign"] if asked is not None and asked["axis"] else ""
-    if not sign:
-        sign = "-" if np.dot(along - along.mean(), measured - measured.mean()) < 0.0 else "+"
-    return support, sign.replace("+", "") + axis, -along if sign == "-" else along
+def _modelled(
+    run: Run, rows: NDArray[np.integer], measured: Array, text: str | None
+) -> tuple[ReactionInDirection, Array, float]:
+    """The reaction compared, its values (e,), and the largest force on its support in any direction."""
+    asked = _REACTION.fullmatch(text or "")
+    support, axis, sign = asked.group("support", "axis", "sign") if asked else (_most_loaded(run, rows), None, None)
+    force = _values(_force_field(run.model, support), run.parameters[rows])
+    largest = "xyz"[int(np.abs(force).max(axis=0).argmax())]
+    reaction = _reaction(run.model, support, axis or largest, sign)
+    reaction = reaction.following(force[:, reaction.axis], measured)
+    modelled = reaction.sign * force[:, reaction.axis]
+    reaction.check_growth(modelled, measured)
+    return reaction, modelled, float(np.linalg.norm(force, axis=1).max())
 
 
-def _forces(run: Run, rows: NDArray[np.integer]) -> dict[str, Array]:
-    """The model's force (e, 3) on each support in the estimated states."""
+def _most_loaded(run: Run, rows: NDArray[np.integer]) -> str:
+    """The support with the largest force in rows of the run."""
     fields = _force_fields(run.model)
-    return {name: np.array([field.value(run.parameters[row])[0] for row in rows]) for name, field in fields.items()}
+    return max(fields, key=lambda name: float(np.abs(_values(fields[name], run.parameters[rows])).max()))
+
+
+def _values(field: SeparatedField, states: Array) -> Array:
+    """A force (e, 3) at parameters (e, d)."""
+    return np.array([field.value(mu)[0] for mu in states])
+
+
+def _force_field(model: ReducedModel, support: str) -> SeparatedField:
+    """The force on a support; EvaluationError if the model has none."""
+    fields = _force_fields(model)
+    if support not in fields:
+        raise EvaluationError(f"the model has no force on '{support}'; it has those on {', '.join(fields)}")
+    return fields[support]
 
 
 def _force_fields(model: ReducedModel) -> dict[str, SeparatedField]:
-    """The force on each support; EvaluationError if the model has none."""
+    """The force on each support; EvaluationError if the model has no reactions."""
     fields = {name[len(FORCE) :]: f for name, f in model.reactions.items() if name.startswith(FORCE)}
     if not fields:
         raise EvaluationError(
@@ -302,11 +420,14 @@ def _force_fields(model: ReducedModel) -> dict[str, SeparatedField]:
     return fields
 
 
-def _fit(modelled: Array, measured: Array) -> tuple[float, float, float]:
-    """Factor, offset and the factor's standard deviation of the line through ``measured`` (e,) by ``modelled`` (e,)."""
+def _fit(modelled: Array, measured: Array, size: float) -> tuple[float, float, float]:
+    """Factor, offset and the factor's standard deviation of the line through ``measured`` (e,) by ``modelled`` (e,).
+
+    ``size`` is the support's largest force: what changes by less than its rounding does not change.
+    """
     centred = modelled - modelled.mean()
     spread = float(centred @ centred)
-    if not spread > (1e-9 * float(np.abs(modelled).max())) ** 2 * len(modelled):
+    if not spread > (ROUNDING * size) ** 2 * len(modelled):
         raise EvaluationError(
             "the model's force is the same in all frames compared: no factor can be found. Compare frames in which "
             "the load grows, or name another support or direction (--reaction)"
@@ -354,10 +475,15 @@ def summarise_force(error: ForceError) -> dict[str, Any]:
 
 def force_remarks(figures: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures must know: which reaction it is, and frames that were not compared."""
-    lines = [f"the force on '{figures['support']}' in direction {figures['direction']} of the object frame"]
+    lines = [reaction_remark(figures)]
     if frames := figures["tracked_frames_off_the_curve"]:
         lines.append(f"{len(frames)} tracked frames are not on the curve and were not compared: {_some(frames)}")
     return lines
+
+
+def reaction_remark(figures: Mapping[str, Any]) -> str:
+    """Which reaction of the model measured forces are compared with."""
+    return f"the force on '{figures['support']}' in direction {figures['direction']} of the object frame"
 
 
 def _some(frames: Sequence[int]) -> str:

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from scipy.stats import qmc, t
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.identification.measurements import Measurement
+from morph_dslam.identification.measurements import MeasuredForces, Measurement
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 
@@ -125,13 +125,19 @@ def identify(
     ------
     IdentificationError
         If a parameter is not the model's, or nothing measured depends on one.
+    EvaluationError
+        If the force that fits best falls where the measured one grows: it is that in the opposite direction.
     """
     unknowns = _unknowns(model, parameters, moduli)
     if not measurements and not prior:
         raise IdentificationError("nothing was measured: give points or forces")
     fit = _Fit(model, unknowns, measurements, prior or {})
-    theta = fit.best()
-    return fit.result(theta)
+    found = fit.result(fit.best())
+    for misfit in found.misfits:
+        # Only now, for the sign of a force may depend on what is identified.
+        if isinstance(misfit.measurement, MeasuredForces):
+            misfit.measurement.compared.check_growth(misfit.predicted, misfit.measurement.values)
+    return found
 
 
 def _unknowns(model: ReducedModel, names: Sequence[str], moduli: bool) -> list[Parameter]:

@@ -247,7 +247,8 @@ class MeasuredForces:
     ----------
     model : of the object.
     curve : the measured forces.
-    reaction : the model's force in the direction in which they were measured.
+    reaction : the model's force in the direction in which they were measured; without a sign of its own, it has the one
+        in which it grows with the measured force, at known parameters and the defaults of all others.
     run : whose frames the curve is given by, and whose estimates are the parameters that are not identified; None for a
         curve over a parameter.
     """
@@ -296,8 +297,15 @@ class MeasuredForces:
         groups[np.argsort(self.places, kind="stable")] = np.arange(count) * min(STRETCHES, count) // count
         return groups
 
+    @cached_property
+    def compared(self) -> ReactionInDirection:
+        """The reaction with its sign."""
+        states = [self.model.vector(known) for known in self._known]
+        along = np.array([self.reaction.field.value(mu)[0, self.reaction.axis] for mu in states])
+        return self.reaction.following(along, self.values)
+
     def predict(self, unknowns: Unknowns) -> Array:
-        return unknowns.factor * np.array([self.reaction(unknowns.vector(known)) for known in self._known])
+        return unknowns.factor * np.array([self.compared(unknowns.vector(known)) for known in self._known])
 
     @cached_property
     def _known(self) -> list[dict[str, float]]:

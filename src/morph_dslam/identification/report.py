@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from morph_dslam.evaluation.force import reaction_remark
 from morph_dslam.identification.identify import Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
 from morph_dslam.model import Parameter
@@ -56,6 +57,7 @@ def _misfit_figures(misfit: Misfit) -> dict[str, Any]:
     if isinstance(measurement, MeasuredForces):
         units = {p.name: p for p in measurement.model.parameters}
         rates = measurement.loading_rates.items()
+        figures |= {"support": measurement.compared.support, "direction": measurement.compared.direction}
         figures["loading_rate_per_frame"] = {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates}
     return figures | ({"offset": measurement.scale * misfit.offset} if measurement.has_offset else {})
 
@@ -91,6 +93,8 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
     for each in figures["measurements"]:
         offset = f", offset {each['offset']:.3g} {each['unit']}" if "offset" in each else ""
         said.append(f"{each['name']}: {each['values']} values missed by {each['rms']:.3g} {each['unit']} rms{offset}")
+        if "support" in each:
+            said.append(f"note: {each['name']} is compared with {reaction_remark(each)}")
         rates = each.get("loading_rate_per_frame")
         if rates is not None:
             rate = ", ".join(f"{name} {rate:.3g} a frame" for name, rate in rates.items())
