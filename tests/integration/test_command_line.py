@@ -111,10 +111,11 @@ def project(sequence, tmp_path):
 
 
 def test_what_is_not_named_is_found_in_the_folder(sequence, project, capsys):
-    assert cli.main(["track", str(project), "--no-video"]) == 0
+    assert cli.main(["track", str(project), "--no-video", "--range", "0-"]) == 0
     command = capsys.readouterr().out.splitlines()[0].split()
     inputs = [f"{project}/{name}" for name in ("pictures", "rubber.morph", "phone.yaml", "clicked.csv", "run")]
     assert [word for word in command if str(project) in word] == inputs
+    assert command[3:6] == ["--no-video", "--range", "0-"]
     with h5py.File(sequence / "run" / "result.h5") as named, h5py.File(project / "run" / "result.h5") as found:
         np.testing.assert_array_equal(found["parameters"][()], named["parameters"][()])
 

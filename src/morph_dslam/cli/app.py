@@ -30,7 +30,7 @@ OUTPUT_CLOSED = 141
 
 
 def new_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; what it parses has `run`, the command, and `kept`."""
+    """The parser of all commands; what it parses has `run`, the command, and `kept`; `main` adds `words`."""
     parser = argparse.ArgumentParser(
         prog="morph", description="Track a deformable solid in video with a physics-based reduced model."
     )
@@ -87,4 +87,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status of `run_and_report_errors`."""
     given = sys.argv[1:] if arguments is None else arguments
     parsed = new_parser().parse_args(with_signed_sections(given))
+    parsed.words = list(given)
     return run_and_report_errors(parsed.run, parsed, parsed.kept)

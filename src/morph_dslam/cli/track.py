@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _complete(arguments: argparse.Namespace) -> None:
-    """Find in the folder ``arguments.frames`` what is not named, and print the command that names it all.
+    """Find in the folder ``arguments.frames`` what is not named, and print the command with it.
 
     A model that is not there is built from the study that is.
     """
@@ -100,13 +100,14 @@ def _complete(arguments: argparse.Namespace) -> None:
         raise TrackingError(f"name {', '.join(named)} too, or give a folder that holds all inputs in place of {folder}")
     found = find_inputs(folder)
     if not starts:
-        starts = [found.start[0]]
+        missing.insert(2, found.start[0])
         setattr(arguments, *found.start)
     arguments.frames, arguments.camera = found.recording, arguments.camera or found.camera
     arguments.model = arguments.model or _found_model(found)
     arguments.output = arguments.output or folder / "run"
-    named = [(f"--{name}", str(getattr(arguments, name))) for name in ("model", "camera", *starts)]
-    print(shlex.join(["morph", "track", str(arguments.frames), *chain(*named), "-o", str(arguments.output)]))
+    words = [str(arguments.frames) if Path(word) == folder else word for word in arguments.words]
+    named = [(f"--{name}", str(getattr(arguments, name))) for name in missing]
+    print(shlex.join(["morph", *words, *chain(*named)]))
 
 
 def _found_model(found: FoundInputs) -> Path:

@@ -37,6 +37,10 @@ class RunWarning(StrEnum):
         "frames: there the object deforms otherwise, as by another law, support or shape, a crack or a slip, or the "
         "camera is another one"
     )
+    RIGID_FAILS = (
+        "up to {largest_px:.1f} px that neighbouring points have in common are left in {count} of {n_frames} frames: "
+        "the mesh, its place in the map or the camera file is off by as much"
+    )
     SURFACE_JUMPS = (
         "from frame {first} on the surface opens or slips along a line, as at a crack, which the model does not have: "
         "by up to {where}; stress near it does not hold and is drawn grey (plots/jumps.png)"
@@ -103,7 +107,8 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     failed = sum(result.warning(ModelDoesNotExplain) is not None for result in run.results)
     if failed:
         largest = float(np.nanmax(run.unexplained_px()))
-        found.append(of(RunWarning.MODEL_FAILS, count=failed, n_frames=n_frames, largest_px=largest))
+        warning = RunWarning.MODEL_FAILS if run.model.parameters else RunWarning.RIGID_FAILS
+        found.append(of(warning, count=failed, n_frames=n_frames, largest_px=largest))
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
         found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))
