@@ -68,7 +68,7 @@ def test_other_supports_hold_still_meanwhile() -> None:
 def test_the_order_enters_the_fingerprint_where_there_is_one() -> None:
     plain = strip_study(False, supports=[{"kind": "fixed", "on": "x_min"}, SHORTER], loads=[UP, DOWN])
     assert strip_study(False).fingerprint() == plain.fingerprint() != strip_study(True).fingerprint()
-    with pytest.raises(StudyError, match=r"unknown key supports\.0\.first; known here: kind, on"):
+    with pytest.raises(StudyError, match=r"support 1: unknown key first; known here: kind, on"):
         strip_study(True, supports=[{"kind": "fixed", "on": "x_min", "first": True}])
 
 

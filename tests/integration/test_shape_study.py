@@ -109,7 +109,7 @@ def test_mistakes_in_a_displacement_field_are_named(tmp_path: Path) -> None:
         tube_study("20 mm", "30 mm", [shape | {"unit": "cm"}]).problem()
     with pytest.raises(StudyError, match=r"cannot read the solution .*none\.vtu"):
         tube_study("20 mm", "30 mm", [shape | {"file": "none.vtu"}]).problem()
-    with pytest.raises(StudyError, match=r"shape\.0\.unit: unknown unit|shape\.0\.unit: .*furlong"):
+    with pytest.raises(StudyError, match=r"shape 1: unit: 'furlong' is not a unit of length"):
         tube_study("20 mm", "30 mm", [shape | {"unit": "furlong"}])
     with pytest.raises(StudyError, match=r"holds values that are not finite"):
         tube_study("20 mm", "30 mm", [write_field(tmp_path / "nan.vtu", component=np.nan)]).problem()
@@ -139,5 +139,5 @@ def test_mistakes_in_a_shape_are_named() -> None:
         tube_study("20 mm", "30 mm", [RADIUS | {"axis": [0, 0, 0]}]).problem()
     with pytest.raises(StudyError, match=r"shape 1: 'growht' names 'growht', which is no parameter"):
         tube_study("20 mm", "30 mm", [THICKNESS | {"amplitude": "growht"}])
-    with pytest.raises(StudyError, match=r"unknown key shape\.0\.width; known here: amplitude, kind"):
+    with pytest.raises(StudyError, match=r"shape 1: unknown key width; known here: amplitude, kind"):
         tube_study("20 mm", "30 mm", [RADIUS | {"width": "1 mm"}])

@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.errors import EvaluationError, MorphError, RegistrationError, StudyError, TrackingError
+from morph_dslam.errors import EvaluationError, ModelFileError, MorphError, RegistrationError, StudyError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.folders import make_run_folder
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
-from morph_dslam.model import save_model
+from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.inp_writing import save_mesh
+from morph_dslam.model import load_model, save_model
 from morph_dslam.registration.board import load_board
+from morph_dslam.registration.messages import WrongUnit
 from morph_dslam.studies.study import load_study
-from tests.support.block_study import write_study
+from tests.support.block_study import STUDY, write_study
 from tests.support.documents import PROJECT
 from tests.support.run_folders import write_run
 from tests.support.small_models import block_model
@@ -182,3 +185,164 @@ def test_mistakes_in_a_study_are_named_with_its_file(tmp_path, change, expected)
     assert "study.toml" in str(caught.value)
     with pytest.raises(StudyError, match="cannot read the study file"):
         load_study(tmp_path / "absent.toml")
+
+
+def message_of_study(folder, *changes):
+    """What is said of a study with changes, without the file's name, which must come first."""
+    path = write_study(folder, *changes)
+    with pytest.raises(StudyError) as caught:
+        load_study(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    return str(caught.value).removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (
+            ('kind = "fixed"\n', ""),
+            'support 1 has no kind: write kind = "fixed", "displacement", "rotation" or "foundation"',
+        ),
+        (
+            ('"fixed"', '"fixd"'),
+            "support 1: 'fixd' is not a known kind (did you mean 'fixed'?); known are fixed, displacement, rotation, "
+            "foundation",
+        ),
+        (
+            ('generator = "block"', 'generator = "blok"'),
+            "mesh: 'blok' is not a known generator (did you mean 'block'?); known are block, tube, revolution",
+        ),
+        (('name = "block"', "name = 5"), "name: 5 must be a text in quotes"),
+        (('on = "z_min"', 'on = ["left"]'), "support 1: on: ['left'] must be a text in quotes"),
+        (('on = "z_min"', 'on = "z_min"\nonn = 3'), "support 1: unknown key onn; known here: kind, on"),
+        (('on = "z_min"\n', ""), "support 1: on is missing"),
+        (("[[supports]]", "[supports]"), "supports must be a list, not a table: write [[supports]]"),
+        (("divisions = [1, 1, 3]", "divisions = [1, 1]"), "mesh.divisions, entry 3 is missing"),
+        (("[1, 1, 3]", "[1, 1, 3, 5]"), "mesh.divisions has 4 entries, and must have at most 3"),
+        (("[1, 1, 3]", "[1, 1.5, 3]"), "mesh.divisions, entry 2: 1.5 must be a whole number"),
+        (
+            ('"20 mm", "20 mm", "60 mm"', '"20 mm", "-20 mm", "60 mm"'),
+            "mesh.size, entry 2: '-20 mm' must be greater th",
+        ),
+        (('"60 mm"', '"6O mm"'), "mesh.size, entry 3: '6O mm' is not a number and a unit, as \"20.5 mm\" is"),
+        (('"60 mm"', "[6]"), 'mesh.size, entry 3: write a number with its unit in quotes, "20 mm" for example'),
+        (
+            ("training = 24", 'training = "2,4"'),
+            "sampling.training: '2,4' must be a whole number, with a point in place",
+        ),
+        (
+            ("training = 24", 'scheme = "grids"'),
+            "sampling.scheme: 'grids' must be 'sobol', 'even', 'grid' or 'adaptive'",
+        ),
+        (("training = 24", 'points = "x"'), "sampling.points: 'x' must be a whole number or a list"),
+        (("training = 24", "points = [2, 1.5]"), "sampling.points, entry 2: 1.5 must be a whole number"),
+        (('law = "neo_hookean"', "law = 3"), "materials.rubber.law: 3 must be a text in quotes"),
+        (
+            ('range = ["2 MPa", "4 MPa"]', 'range = [["2 MPa"], 4]'),
+            "parameters.young.range, entry 1: ['2 MPa'] must be",
+        ),
+        (('["push", "0 Pa", "pull"]', '["push", "0 Pa", "-1 * pul"]'), "load 1: '-1 * pul' names 'pul', which is no"),
+        (("poisson = 0.3", "poisson = 0.5"), "materials.rubber: neo_hookean: "),
+    ],
+)
+def test_what_is_wrong_with_a_study_is_said_in_its_own_words(tmp_path, change, expected):
+    said = message_of_study(tmp_path, change)
+    assert said.startswith(expected)
+    assert "Input" not in said
+
+
+def test_the_first_of_several_sections_is_number_one(tmp_path):
+    second = '[[supports]]\nkind = "displacement"\non = "z_max"\nx = {}\n[[loads]]'
+    assert message_of_study(tmp_path, ("[[loads]]", second.format('"-1 * pul"'))).startswith("support 2: '-1 * pul'")
+    said = message_of_study(tmp_path, ("[[loads]]", second.format("[1]")))
+    assert said == "support 2: x: [1] must be a text in quotes or a number"
+
+
+def test_a_material_that_is_unstable_is_named_as_in_the_study(tmp_path):
+    law = 'law = "mooney_rivlin"\nc10 = "young"\nc01 = "0.1 MPa"\nbulk = "0 MPa"\n'
+    said = message_of_study(tmp_path, ('law = "neo_hookean"\nyoung = "young"\npoisson = 0.3\n', law))
+    assert said == "materials.rubber: mooney_rivlin: bulk = 0 must be positive"
+
+
+@pytest.mark.parametrize(
+    ("unit", "drawn", "change", "expected"),
+    [
+        ("inch", "mm", None, "mesh.unit: 'inch' is not a unit of length; use one of m, cm, mm, um"),
+        (
+            "um",
+            "mm",
+            None,
+            'mesh.unit: in "um" the mesh measures 2e-05 x 2e-05 x 6e-05 m, which is hardly meant; if it',
+        ),
+        ("um", "mm", None, 'if it was drawn in mm, write "mm"'),
+        ("m", "mm", None, 'if it was drawn in mm, write "mm"'),
+        ("um", "m", None, 'if it was drawn in m, write "m"'),
+        (
+            "mm",
+            "mm",
+            ('on = "z_min"', 'on = "lefft"'),
+            "support 1: on: the mesh has no node set or surface 'lefft'; it has:",
+        ),
+        ("mm", "mm", ('on = "z_max"', 'on = "rigth"'), "load 1: on: the mesh has no surface 'rigth'; it has: "),
+        ("mm", "mm", ('law = "neo', 'on = "core"\nlaw = "neo'), "materials.rubber.on: the mesh has no cell set 'core'"),
+    ],
+)
+def test_a_mesh_file_that_does_not_fit_the_study(tmp_path, refused, unit, drawn, change, expected):
+    save_mesh(tmp_path / "part.inp", block((0.02, 0.02, 0.06), (1, 1, 3), "hex8"), drawn)
+    generated = STUDY[STUDY.index("generator") : STUDY.index("[materials")]
+    study = write_study(tmp_path, (generated, f'file = "part.inp"\nunit = "{unit}"\n'), *([change] if change else []))
+    said = refused("build", study, "-o", tmp_path / "block.morph")
+    assert said.startswith(f"morph: {study}: ")
+    assert expected in said
+
+
+def test_what_a_model_is_made_from_is_no_model(folder):
+    study = write_study(folder)
+    with pytest.raises(ModelFileError, match=r"study\.toml is a study, not a model: build it first with `morph build "):
+        load_model(study)
+    for name in ("tumour.ply", "part.inp"):
+        save_mesh(folder / "part.inp", block((0.02, 0.02, 0.06), (1, 1, 3), "hex8"), "mm")
+        with pytest.raises(ModelFileError, match=f"{name} is a mesh, not a model: name it in the "):
+            load_model(folder / name)
+    whole = (folder / "block.morph").read_bytes()
+    (folder / "block.morph").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ModelFileError, match=r"damaged or cut short .*does not match its checksum"):
+        load_model(folder / "block.morph")
+
+
+def test_landmarks_separated_by_semicolons(tmp_path):
+    (tmp_path / "landmarks.csv").write_text("x_mm;y_mm;z_mm;u_px;v_px\n1,5;2;3;4;5\n")
+    with pytest.raises(RegistrationError, match=r"landmarks\.csv: .*semicolons: .* by commas, .* decimal points"):
+        load_landmarks(tmp_path / "landmarks.csv")
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (1 / 25.4, "inches"), (0.1, "centimetres")])
+def test_landmarks_in_a_wrong_unit_may_be_their_own_fault(factor, unit):
+    said = WrongUnit(0.3e-3, 0.3, factor, "millimetres", "metres").hint
+    assert f"multiplied by {factor:.4g}: either the landmark file is in {unit}, where its columns x_mm" in said
+    assert said.endswith("a mesh in millimetres was taken for one in metres: correct its unit in the study")
+
+
+def test_landmarks_in_no_wrong_unit_leave_the_mesh():
+    said = WrongUnit(0.2, 0.5, 1 / 2.54, "centimetres", "inches").hint
+    assert "landmark file" not in said
+    assert said.endswith("perhaps a mesh in centimetres was taken for one in inches: correct its unit in the study")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            CAMERA.replace("fx: 528", "fx: 30800,0"),
+            "fx: '30800,0' must be a number, with a point in place of the comma",
+        ),
+        (CAMERA.replace("width: 640", "width: 640.5"), "width: 640.5 must be a whole number"),
+        (CAMERA + "distortion: 0.1\n", "distortion: 0.1 must be a list"),
+        (CAMERA + "distortion: [0.1, x]\n", "distortion, entry 2: 'x' must be a number"),
+    ],
+)
+def test_numbers_of_a_camera_that_are_none(tmp_path, text, expected):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(MorphError) as caught:
+        load_camera(tmp_path / "camera.yaml")
+    assert str(caught.value).startswith(f"{tmp_path / 'camera.yaml'}: {expected}")

@@ -210,7 +210,7 @@ def test_build_warns_of_elements_method_and_stability():
     [
         (('"2 MPa"', '"1e300 MPa"'), "parameters.young: '1e300 MPa' cannot be meant"),
         (("poisson = 0.3", "poisson = nan"), "materials.rubber: poisson: 'nan' cannot be meant"),
-        (('"20 mm", "20 mm", "60 mm"', '"20 mm", "20 mm", "1e300 mm"'), "mesh.size.2: '1e300 mm' cannot"),
+        (('"20 mm", "20 mm", "60 mm"', '"20 mm", "20 mm", "1e300 mm"'), "mesh.size, entry 3: '1e300 mm' cannot"),
         (("divisions = [1, 1, 3]", "divisions = [500, 500, 500]"), "mesh.divisions: these make 125000000 cells"),
         (("training = 24", "training = 1000000000"), "sampling.training: "),
         (("training = 24", "training = 24\nseed = -1"), "sampling.seed: "),
@@ -226,10 +226,10 @@ def test_numbers_that_no_study_means_are_one_message(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("bend = [0.5, 1.2]", "bend = [0.5, inf]"), "parameters.bend.1"),
+        (("bend = [0.5, 1.2]", "bend = [0.5, inf]"), "parameters.bend, entry 2: inf must be a finite number"),
         (('depth = "12 mm"', 'depth = "nan mm"'), "grips.depth: 'nan mm' cannot be meant"),
-        (("divisions = [8, 6]", "divisions = [0, 6]"), "solver.divisions.0"),
-        (("grid = [48, 34]", "grid = [48, 100000]"), "reduction.grid.1"),
+        (("divisions = [8, 6]", "divisions = [0, 6]"), "solver.divisions, entry 1: 0 must be at least 1"),
+        (("grid = [48, 34]", "grid = [48, 100000]"), "reduction.grid, entry 2: 100000 must be at most 1000"),
     ],
 )
 def test_numbers_that_no_sheet_means_are_one_message(change, message):

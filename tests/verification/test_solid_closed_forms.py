@@ -15,6 +15,7 @@ from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchh
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.newton import solve
 from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
+from morph_dslam.meshing.extrusion import Hole, extrusion
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.mesh_files import load_mesh
 from tests.support.solids import FACES, ROLLERS, RUBBER, AffineSupport, distorted, load_parameter, solved
@@ -53,6 +54,23 @@ def test_uniaxial_traction_is_the_inverse_of_stretch() -> None:
     state = solved(problem, 1.0)
     at_end = problem.nodal_displacement(state.dofs)[mesh.set_nodes("x_max"), 0]
     np.testing.assert_allclose(at_end, 0.5, rtol=2e-6)
+
+
+def test_the_stress_at_a_hole_is_that_of_the_table() -> None:
+    """A plate 40 mm wide with a hole of 20 mm under tension: 2.16 of the net stress (Howland 1930; Peterson's fit)."""
+    corners = 1e-3 * np.array([[-60.0, -20.0], [60.0, -20.0], [60.0, 20.0], [-60.0, 20.0]])
+    mesh = extrusion(corners, 1e-3, 2e-3, holes=[Hole((0.0, 0.0), 20e-3)])
+    symbols = load_parameter(pull=0.0)
+    gross = 1e3  # small against the modulus, so that the plate keeps its shape
+    load = DeadTraction("x_max", (gross * symbols["pull"], 0.0, 0.0))
+    problem = SolidProblem(mesh, {"all": HOOKE}, [fixed("x_min")], [load], symbols)
+    state = solved(problem, 1.0)
+    fields = problem.recovery.at_nodes(state.dofs, state.mu, ("stress",))
+    beside = np.abs(mesh.nodes[:, 0]) + np.abs(np.abs(mesh.nodes[:, 1]) - 10e-3) < 1e-6
+    assert beside.any()
+    share = 0.5
+    expected = (3.0 - 3.13 * share + 3.66 * share**2 - 1.53 * share**3) / (1.0 - share)
+    assert fields["von_mises"][beside].mean() / gross == pytest.approx(expected, rel=0.03)
 
 
 def test_simple_shear() -> None:

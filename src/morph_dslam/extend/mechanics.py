@@ -57,6 +57,7 @@ from morph_dslam.mechanics.supports import (
     RigidRotation as RigidRotation,
     fixed as fixed,
 )
+from morph_dslam.meshing.extrusion import Hole as Hole, extrusion as extrusion
 from morph_dslam.meshing.generators import Profile as Profile, block as block, revolution as revolution, tube as tube
 from morph_dslam.meshing.inp_writing import save_mesh as save_mesh
 from morph_dslam.meshing.mesh_checks import check_mesh as check_mesh

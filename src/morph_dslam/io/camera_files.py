@@ -137,7 +137,7 @@ def parse_camera(content: object, where: str) -> Camera:
         values = _CameraFile.model_validate(content)
     except ValidationError as error:
         raise CameraError(
-            f"{where}: {explain(_CameraFile, error)}; a camera file has width, height, fx, fy, cx, cy "
+            f"{where}: {explain(_CameraFile, error, content)}; a camera file has width, height, fx, fy, cx, cy "
             "and optionally distortion [k1, k2, p1, p2, k3], lens and readout_s"
         ) from error
     intrinsics = (values.width, values.height, values.fx, values.fy, values.cx, values.cy)

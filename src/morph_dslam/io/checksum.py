@@ -50,11 +50,18 @@ def is_other_hdf5(path: Path) -> bool:
         return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
 
 
+def begins_with(path: Path, title: str) -> bool:
+    """Whether a file begins with the title, so that it is of this kind or damaged behind its head."""
+    line = f"{title}\n".encode()
+    with path.open("rb") as file:
+        return file.read(len(line)) == line
+
+
 def check_checksum(path: Path, title: str) -> None:
     """Raise ValueError, which says why, if a file does not begin with the title, or was changed later."""
+    if not begins_with(path, title):
+        raise ValueError("it does not begin as such a file")
     with path.open("rb") as file:
         found = file.read(BLOCK)
-    if not found.startswith(f"{title}\n".encode()):
-        raise ValueError("it does not begin as such a file")
     if found != _block(path, title):
         raise ValueError("its content does not match its checksum")

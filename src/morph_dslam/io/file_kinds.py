@@ -35,6 +35,7 @@ _PATTERNS = {kind: re.compile(beginning, re.DOTALL) for kind, beginning in _BEGI
 _SAME = {".jpeg": ".jpg", ".tiff": ".tif", ".stp": ".step", ".xmf": ".xdmf"}
 IMAGES = (".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm", ".ppm")
 VIDEOS = (".mp4", ".mkv", ".avi")
+MESHES = (".inp", ".msh", ".vtk", ".vtu", ".step", ".stl", ".obj", ".ply")
 #: Bytes that tell it.
 _HEAD = 4096
 #: A binary STL file has a header of so many bytes, a count, and so many bytes for each triangle.

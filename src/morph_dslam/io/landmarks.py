@@ -47,6 +47,11 @@ def load_landmarks(path: Path) -> Landmarks:
     lines = read_text(path, "landmarks", RegistrationError).splitlines()
     rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
+    if len(header) == 1 and ";" in header[0]:
+        raise RegistrationError(
+            f"{path}: its columns are separated by semicolons: separate them by commas, and write numbers with decimal "
+            "points"
+        )
     if header not in (HEADER, (FRAME, *HEADER)):
         raise RegistrationError(
             f"{path}: the first line of a landmark file is {','.join(HEADER)}, with {FRAME} before it in a map"

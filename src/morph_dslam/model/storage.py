@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import ModelFileError
-from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_checksum
+from morph_dslam.io.checksum import begins_with, check_checksum, is_other_hdf5, written_with_checksum
+from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
 from morph_dslam.model.reduced_model import REACTION, Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
@@ -216,9 +217,26 @@ def _read_model(file: h5py.File) -> ReducedModel:
     return model
 
 
-def _open_and_read(path: Path) -> ReducedModel:
+def _check_kind(path: Path) -> None:
+    """Raise ModelFileError if a file is no model but what one is made from, or a file of another program."""
     if is_other_hdf5(path):
         raise ModelFileError(f"{path} is an HDF5 file but not a morph-dslam model")
+    if begins_with(path, FORMAT):
+        return
+    if path.suffix.lower() == ".toml":
+        raise ModelFileError(
+            f"{path} is a study, not a model: build it first with `morph build {path} -o {path.stem}.morph`, and give "
+            f"{path.stem}.morph"
+        )
+    if file_kind(path) in MESHES:
+        raise ModelFileError(
+            f"{path} is a mesh, not a model: name it in the [mesh] of a study and build that with `morph build`, or a "
+            "rigid object's surface with `morph build --rigid`"
+        )
+
+
+def _open_and_read(path: Path) -> ReducedModel:
+    _check_kind(path)
     check_checksum(path, FORMAT)
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from math import isclose
 from typing import Any, ClassVar
 
 from morph_dslam.notices import Notice
@@ -145,6 +146,10 @@ class OtherSize(RegistrationWarning):
     ratio: float
 
 
+#: Units that landmarks may be in by mistake, in millimetres, which they should be in.
+_UNITS_MM = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
+
+
 @dataclass(frozen=True)
 class WrongUnit(RegistrationWarning):
     """The landmarks lie on a part of the object, and would lie all over it in another unit.
@@ -173,9 +178,14 @@ class WrongUnit(RegistrationWarning):
     @property
     def hint(self) -> str:
         """What to do, for the end of a sentence."""
+        fit = f"; they fit if its mesh is multiplied by {self.factor:.4g}: "
+        mesh = f"a mesh in {self.meant} was taken for one in {self.taken}: correct its unit in the study"
+        unit = next((name for name, size in _UNITS_MM.items() if isclose(size * self.factor, 1.0)), None)
+        if unit is None:
+            return f"{fit}perhaps {mesh}"
         return (
-            f"; they fit if its mesh is multiplied by {self.factor:.4g}: one in {self.meant} was taken for one in "
-            f"{self.taken}, perhaps, so correct its unit in the study"
+            f"{fit}either the landmark file is in {unit}, where its columns x_mm, y_mm and z_mm are millimetres, or "
+            f"{mesh}"
         )
 
 

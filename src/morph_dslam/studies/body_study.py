@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
@@ -27,10 +28,31 @@ def check_names(parameters: dict[str, ParameterSection]) -> dict[str, ParameterS
     return parameters
 
 
+def numbered(kind: str, sections: Iterable[Any]) -> list[tuple[str, Any]]:
+    """Sections of a list with what messages call them, as `morph_dslam.io.sections` does."""
+    return [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
+
+
+#: A set of the mesh that a study names: the key there, its name, and what finds its members.
+NamedSet = tuple[str, str, Callable[[str], NDArray[np.int64]]]
+
+
+def check_sets(sets: Iterable[NamedSet]) -> None:
+    """Raise StudyError, which begins with the key, if a set is not in the mesh, or empty."""
+    for key, name, find in sets:
+        try:
+            members = find(name)
+        except StudyError as error:
+            raise StudyError(f"{key}: {error}") from error
+        if not len(members):
+            raise StudyError(f"{key}: the set '{name}' of the mesh is empty; name another, or fill it")
+
+
 def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter]) -> None:
     """Read every value of sections with ``make``, so that a mistake is found before anything is solved.
 
-    Raises ValueError saying in which of the ``parts``, named sections, it is.
+    Materials are checked at the defaults of the parameters. Raises ValueError saying in which of the ``parts``, named
+    sections, the mistake is.
     """
     defaults = np.array([p.default for p in parameters])
 
@@ -39,7 +61,9 @@ def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter])
 
     for where, section in parts:
         try:
-            section.make(read)
+            made = section.make(read)
+            if isinstance(made, Material):
+                made.check()
         except StudyError as error:
             raise ValueError(f"{where}: {error}") from error
 

@@ -62,12 +62,21 @@ def build(
     if output is None:
         with TemporaryDirectory() as folder:
             return build(study, Path(folder) / "model.morph", workers, executor)
-    begin = time.monotonic()
     output = Path(output)
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
     described, text = _read(study)
-    chosen = resolve_defaults(described)
+    try:
+        return _built(described, text, output, workers, executor)
+    except StudyError as error:
+        if isinstance(study, str | Path):
+            raise StudyError(f"{_file_of(study)}: {error}") from error
+        raise
+
+
+def _built(study: Study, text: str, output: Path, workers: int | None, executor: Executor | None) -> ReducedModel:
+    begin = time.monotonic()
+    chosen = resolve_defaults(study)
     snapshots = take_snapshots(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
     model = certified_model(snapshots, chosen.reduction, chosen.name)
     if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
@@ -89,9 +98,13 @@ def _read(study: str | Path | Study) -> tuple[Study, str]:
     """A study and the text that says what it is."""
     if not isinstance(study, str | Path):
         return study, study.model_dump_json()
-    path = Path(study)
-    path = path / "study.toml" if path.is_dir() else path
+    path = _file_of(study)
     return load_study(path), path.read_text()
+
+
+def _file_of(study: str | Path) -> Path:
+    path = Path(study)
+    return path / "study.toml" if path.is_dir() else path
 
 
 def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) -> ReducedModel:

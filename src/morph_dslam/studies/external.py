@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.mesh_checks import check_size
 from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.problem import ModelMesh, Snapshot
-from morph_dslam.studies.sections import ReductionSection, Section, StudyPath
+from morph_dslam.studies.sections import LengthUnit, ReductionSection, Section, StressUnit, StudyPath
+from morph_dslam.studies.solid_sections import check_unit
 from morph_dslam.studies.solution_files import SAME, point_data, read_solution
 from morph_dslam.units import quantity_of, to_si
 
@@ -54,10 +54,10 @@ class _ExternalSection(Section):
     """
 
     table: StudyPath
-    length_unit: str
+    length_unit: LengthUnit
     displacement: str = "displacement"
     stress: str | None = None
-    stress_unit: str = "Pa"
+    stress_unit: StressUnit = "Pa"
     strain: str | None = None
 
 
@@ -94,7 +94,7 @@ class ExternalStudy(Section):
             content = read_solution(path, row.get("step"))
             here = _mesh(content, to_si(1.0, self.external.length_unit, "length"), path)
             if mesh is None:
-                check_size(here)
+                check_unit(here, self.external.length_unit, "external.length_unit")
                 mesh = here
             _check_same(mesh, here, path)
             snapshots.append(Snapshot(point, self._fields(content, path)))

@@ -19,20 +19,25 @@ from pydantic import (
 from morph_dslam.errors import StudyError
 from morph_dslam.reduction.registry import reduction_method
 from morph_dslam.studies.affine import LARGEST, possible
-from morph_dslam.units import to_si
+from morph_dslam.units import FACTORS, to_si
 
 
 def quantity(kind: str) -> BeforeValidator:
     """Reads "420 mm" as SI; refuses a bare number, so that no unit is ever guessed."""
 
     def read(value: Any) -> float:
+        example = "mm" if kind == "length" else next(iter(FACTORS[kind]))
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise ValueError(f'write a number with its unit in quotes, "20 {example}" for example')
         if not isinstance(value, str):
-            raise ValueError(f'write the value with its unit, "{value} mm" for example')
-        parts = value.split()
-        if len(parts) != 2:
-            raise ValueError(f"'{value}' is not a number and a unit")
+            raise ValueError(f'write the value with its unit, "{value} {example}" for example')
         try:
-            return to_si(possible(float(parts[0]), value), parts[1], kind)
+            number, unit = value.split()
+            size = float(number)
+        except ValueError:
+            raise ValueError(f"'{value}' is not a number and a unit, as \"20.5 {example}\" is") from None
+        try:
+            return to_si(possible(size, value), unit, kind)
         except StudyError as error:
             raise ValueError(str(error)) from error
 
@@ -48,16 +53,22 @@ Stress = Annotated[float, quantity("stress"), Field(gt=0, allow_inf_nan=False)]
 Angle = Annotated[float, quantity("angle")]
 
 
-def _length_unit(unit: str) -> str:
-    try:
-        to_si(1.0, unit, "length")
-    except StudyError as error:
-        raise ValueError(str(error)) from error
-    return unit
+def _unit(kind: str) -> AfterValidator:
+    """Takes the units of a quantity."""
+
+    def check(unit: str) -> str:
+        try:
+            to_si(1.0, unit, kind)
+        except StudyError as error:
+            raise ValueError(str(error)) from error
+        return unit
+
+    return AfterValidator(check)
 
 
-#: The unit of a file's or a list's lengths.
-LengthUnit = Annotated[str, AfterValidator(_length_unit)]
+#: The unit of a file's or a list's lengths, and of its stresses.
+LengthUnit = Annotated[str, _unit("length")]
+StressUnit = Annotated[str, _unit("stress")]
 
 
 def _in_folder(path: Path, info: ValidationInfo) -> Path:

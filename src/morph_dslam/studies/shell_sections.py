@@ -35,6 +35,7 @@ from morph_dslam.studies.solid_sections import (
     RotationSupport,
     Triple,
     Value,
+    check_unit,
     few_cells,
     file_stamp,
     mesh_kind,
@@ -179,8 +180,13 @@ def shell_mesh(section: Any, sets: dict[str, SetSection]) -> Mesh:
 @lru_cache(maxsize=2)
 def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
     mesh = section.make()
-    check_mesh(mesh)
-    check_surface(mesh)
+    if isinstance(section, _FileSurface):
+        check_unit(mesh, section.unit, "mesh.unit")
+    try:
+        check_mesh(mesh)
+        check_surface(mesh)
+    except StudyError as error:
+        raise StudyError(f"mesh: {error}") from error
     return mesh
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -11,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.shell_problem import ShellOptions, ShellProblem
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
-from morph_dslam.studies.body_study import BodyStudy, check_names, read_once, reader_of
+from morph_dslam.studies.body_study import BodyStudy, NamedSet, check_names, check_sets, numbered, read_once, reader_of
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
@@ -27,6 +28,9 @@ from morph_dslam.studies.shell_sections import (
 from morph_dslam.studies.shell_sweep import ShellSweep
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import mesh_fingerprint
+
+#: Kinds of supports and loads that name a cell set; others name nodes.
+_ON_CELLS = ("foundation", "traction", "pressure", "body_force", "moving_patch", "moving_line")
 
 
 class _ShellSolverSection(WorkSection):
@@ -56,10 +60,7 @@ class ShellStudy(BodyStudy, Section):
     @model_validator(mode="after")
     def _check_values(self) -> ShellStudy:
         """Read every value once, so that a mistake is found before anything is solved."""
-        parts: list[tuple[str, Any]] = [("shell", self.shell), ("material", self.material)]
-        for kind, sections in (("support", self.supports), ("load", self.loads)):
-            parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
-        read_once(parts, self.model_parameters())
+        read_once([("shell", self.shell), ("material", self.material), *self._listed()], self.model_parameters())
         if any(getattr(part, "first", False) for part in (*self.supports, *self.loads)):
             raise ValueError("first is for solids: leave it out, or let a parameter say how much of a load acts")
         if self.material.density is None and any(load.kind == "gravity" for load in self.loads):
@@ -72,8 +73,20 @@ class ShellStudy(BodyStudy, Section):
         return WorkSection(workers=self.solver.workers, threads=self.solver.threads or 1)
 
     def shell_mesh(self) -> Mesh:
-        """The mesh, checked, with the sets of the study."""
-        return shell_mesh(self.mesh, self.sets)
+        """The mesh with the sets of the study, checked together with those that it names."""
+        mesh = shell_mesh(self.mesh, self.sets)
+        check_sets(self._sets(mesh))
+        return mesh
+
+    def _listed(self) -> list[tuple[str, Any]]:
+        """Supports and loads with what messages call them."""
+        return [*numbered("support", self.supports), *numbered("load", self.loads)]
+
+    def _sets(self, mesh: Mesh) -> Iterator[NamedSet]:
+        """The sets that the study names."""
+        for where, section in self._listed():
+            if section.kind != "gravity":
+                yield f"{where}: on", section.on, mesh.cells if section.kind in _ON_CELLS else mesh.set_nodes
 
     def fingerprint(self) -> str:
         """Hash of mesh, shell, material, supports, loads, parameters' names, elements and solver version."""

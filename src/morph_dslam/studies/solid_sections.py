@@ -16,10 +16,12 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
+from morph_dslam.errors import StudyError
 from morph_dslam.mechanics import contact, couplings, loads, supports
 from morph_dslam.mechanics.rigid_mesh import RigidMesh
 from morph_dslam.meshing import generators as mesh_generators
-from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.extrusion import Hole, extrusion
+from morph_dslam.meshing.mesh_checks import LARGEST, SMALLEST, check_mesh
 from morph_dslam.meshing.mesh_files import load_closed_surface, load_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.sections import Angle, LengthUnit, Number, PositiveLength, Section, StudyPath
@@ -29,6 +31,8 @@ CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15
 Count = Annotated[int, Field(ge=1)]
 #: More cells than these are a mistake: no memory holds their factorisation.
 MOST_CELLS = 5_000_000
+#: Units of mesh files, the most usual first, and the diagonal (metres) from which a mesh in one is no surprise.
+_USUAL_UNITS, _LEAST_USUAL = ("mm", "m", "cm", "um"), 2e-3
 
 
 def few_cells(divisions: tuple[int, ...]) -> tuple[int, ...]:
@@ -49,7 +53,7 @@ class FileMesh(Section):
     """
 
     file: StudyPath
-    unit: str
+    unit: LengthUnit
     size: PositiveLength | None = None
 
     def make(self) -> Mesh:
@@ -119,6 +123,38 @@ class _RevolutionMesh(Section):
         return mesh_generators.revolution(profile, self.thickness, self.divisions, self.cells, self.angles, collars)
 
 
+class _HoleSection(Section):
+    """A round hole; ``centre`` is in the outline's unit."""
+
+    centre: tuple[Number, Number]
+    diameter: PositiveLength
+
+
+class _ExtrusionMesh(Section):
+    """A flat part: an outline in the plane z = 0, extruded to z = ``thickness``.
+
+    ``outline`` lists corners [x, y] in order, plain numbers in ``unit``; a third number is the longest edge of a cell
+    there. Sets: z_min, z_max, side_1 (from the first corner to the second), ..., hole_1, ..., and x_min, x_max, y_min,
+    y_max where sides are there.
+    """
+
+    generator: Literal["extrusion"]
+    outline: tuple[Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)], ...]
+    unit: LengthUnit
+    thickness: PositiveLength
+    size: PositiveLength
+    layers: Count = 1
+    holes: tuple[_HoleSection, ...] = ()
+    cells: Literal["prism6", "prism15", "prism18"] = "prism15"
+
+    def make(self) -> Mesh:
+        unit = to_si(1.0, self.unit, "length")
+        corners = [[unit * x for x in corner[:2]] for corner in self.outline]
+        sizes = [unit * corner[2] if len(corner) > 2 else self.size for corner in self.outline]
+        holes = [Hole((unit * hole.centre[0], unit * hole.centre[1]), hole.diameter) for hole in self.holes]
+        return extrusion(corners, self.thickness, self.size, self.cells, self.layers, holes, sizes)
+
+
 def mesh_kind(value: Any) -> str:
     """Tag of a [mesh] section: "file", or its generator."""
     if isinstance(value, Section):
@@ -130,9 +166,23 @@ MeshSection = Annotated[
     Annotated[FileMesh, Tag("file")]
     | Annotated[_BlockMesh, Tag("block")]
     | Annotated[_TubeMesh, Tag("tube")]
-    | Annotated[_RevolutionMesh, Tag("revolution")],
+    | Annotated[_RevolutionMesh, Tag("revolution")]
+    | Annotated[_ExtrusionMesh, Tag("extrusion")],
     Discriminator(mesh_kind),
 ]
+
+
+def check_unit(mesh: Mesh, unit: str, key: str) -> None:
+    """Refuse a mesh from a file whose size is hardly meant; StudyError naming the key and a unit that may be right."""
+    extent = np.ptp(mesh.nodes, axis=0)
+    diagonal = float(np.linalg.norm(extent))
+    if SMALLEST <= diagonal <= LARGEST:
+        return
+    drawn = diagonal / to_si(1.0, unit, "length")
+    better = next((name for name in _USUAL_UNITS if _LEAST_USUAL <= to_si(drawn, name, "length") <= LARGEST), None)
+    advice = f'if it was drawn in {better}, write "{better}"' if better else "look at its coordinates"
+    size = " x ".join(f"{length:.3g}" for length in extent)
+    raise StudyError(f'{key}: in "{unit}" the mesh measures {size} m, which is hardly meant; {advice}')
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
@@ -152,7 +202,12 @@ def make_mesh(section: Any) -> Mesh:
 @lru_cache(maxsize=2)
 def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
     mesh = section.make()
-    check_mesh(mesh)
+    if isinstance(section, FileMesh):
+        check_unit(mesh, section.unit, "mesh.unit")
+    try:
+        check_mesh(mesh)
+    except StudyError as error:
+        raise StudyError(f"mesh: {error}") from error
     return mesh
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,11 +19,10 @@ from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.supports import held_still
-from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.body_study import BodyStudy, check_names, read_once, reader_of
+from morph_dslam.studies.body_study import BodyStudy, NamedSet, check_names, check_sets, numbered, read_once, reader_of
 from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
@@ -31,10 +30,8 @@ from morph_dslam.studies.sections import ReductionSection, SamplingSection, Sect
 from morph_dslam.studies.shape_sections import ShapeSection, shape_fields
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
-    BodyForceLoad,
     ContactSection,
     CouplingSection,
-    GravityLoad,
     LoadSection,
     MeshSection,
     SupportSection,
@@ -46,6 +43,8 @@ from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
 
 #: `SolidOptions.mixed` by the name of a formulation.
 MIXED = {"automatic": None, "displacement": False, "mixed": True}
+#: Kinds of supports, loads and shapes that name a surface; other sections take node sets too.
+_ON_SURFACES = ("foundation", "traction", "pressure", "moving_patch", "moving_line", "thickness")
 
 
 class _SolidSolverSection(WorkSection):
@@ -142,7 +141,10 @@ class SolidStudy(BodyStudy, Section):
 
     def _parts(self) -> list[tuple[str, Any]]:
         """Materials, supports, loads, couplings, contacts and shapes with what messages call them."""
-        parts: list[tuple[str, Any]] = [(f"materials.{name}", section) for name, section in self.materials.items()]
+        return [(f"materials.{name}", section) for name, section in self.materials.items()] + self._listed()
+
+    def _listed(self) -> list[tuple[str, Any]]:
+        """The same without the materials."""
         groups = {
             "support": self.supports,
             "load": self.loads,
@@ -150,9 +152,7 @@ class SolidStudy(BodyStudy, Section):
             "contact": self.contacts,
             "shape": self.shape,
         }
-        for kind, sections in groups.items():
-            parts += [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
-        return parts
+        return [part for kind, sections in groups.items() for part in numbered(kind, sections)]
 
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
@@ -164,18 +164,21 @@ class SolidStudy(BodyStudy, Section):
     def solid_mesh(self) -> Mesh:
         """The mesh, checked together with the sets that the study names."""
         mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
-        held = [part.on for part in (*self.supports, *self.couplings, *self.contacts)]
-        held += [part.against for part in self.contacts if part.kind == "surface" and part.against]
-        regions = [material.on for material in self.materials.values()]
-        for load in self.loads:
-            if isinstance(load, BodyForceLoad):
-                regions.append(load.on)
-            elif not isinstance(load, GravityLoad):
-                held.append(load.on)
-        check_mesh(mesh, held, regions)
-        if self.unknown_loads:
-            mesh.surface(self.unknown_loads.on)
+        check_sets(self._sets(mesh))
         return mesh
+
+    def _sets(self, mesh: Mesh) -> Iterator[NamedSet]:
+        """The sets that the study names."""
+        for name, material in self.materials.items():
+            yield f"materials.{name}.on", material.on, mesh.cells
+        for where, section in self._listed():
+            kind = getattr(section, "kind", "coupling")
+            find = mesh.cells if kind == "body_force" else mesh.surface if kind in _ON_SURFACES else mesh.set_nodes
+            for key in ("on", "against", "kept"):
+                if name := getattr(section, key, None):
+                    yield f"{where}: {key}", name, find
+        if self.unknown_loads:
+            yield "unknown_loads.on", self.unknown_loads.on, mesh.surface
 
     def fingerprint(self) -> str:
         """Hash of mesh, shape, mechanics, parameters' names, elements and solver version."""

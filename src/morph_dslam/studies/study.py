@@ -53,7 +53,7 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
     try:
         return kind.model_validate(dict(content), context={"folder": Path(folder)})
     except ValidationError as error:
-        raise StudyError(f"{where}: {explain(kind, error)}") from error
+        raise StudyError(f"{where}: {explain(kind, error, content)}") from error
 
 
 def _kind(content: Mapping[str, Any]) -> type[Study]:
