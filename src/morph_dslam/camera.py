@@ -28,6 +28,8 @@ TOLERANCE = 1e-10
 MOST_ITERATIONS = 50
 #: A longer readout time is a mistake of units, seconds.
 LONGEST_READOUT_S = 0.5
+#: The least focal length of a lens that is no fisheye, as a share of the image's side: a view of 157 degrees.
+LEAST_FOCAL_SHARE = 0.1
 #: Numbers of coefficients of each lens model.
 COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5, 8), "fisheye": (4,)}
 
@@ -264,6 +266,22 @@ class Camera:
         """Maps that take each pixel from where the camera records its ray (h * w, 3)."""
         pixels = self.project_recorded(rays).astype(np.float32).reshape(self.height, self.width, 2)
         return cv2.convertMaps(pixels, None, cv2.CV_16SC2)  # type: ignore[call-overload]
+
+    def check_focal_length(self, where: str) -> None:
+        """Raise CameraError if a lens that is no fisheye has a view so wide that its unit is probably wrong.
+
+        For cameras as users give them: an undistorted picture of a fisheye may have such a view. ``where`` is where it
+        was written, and begins the message.
+        """
+        if self.lens_model == "fisheye":
+            return
+        for name, focal, side, pixels in (("fx", self.fx, "width", self.width), ("fy", self.fy, "height", self.height)):
+            if focal < LEAST_FOCAL_SHARE * pixels:
+                degrees = np.degrees(2.0 * np.arctan(0.5 * pixels / focal))
+                raise CameraError(
+                    f"{where}: {name} = {focal:g} px at a {side} of {pixels} px is a view of {degrees:.0f} degrees: "
+                    "fx and fy are in pixels, not in millimetres (f in mm times the pixels per mm of the sensor)"
+                )
 
     def check_image(self, image: NDArray, where: str) -> None:
         """Raise CameraError unless ``image`` (height, width, ...) has the calibrated size."""

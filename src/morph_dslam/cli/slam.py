@@ -6,7 +6,7 @@ from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range,
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
 TERMS = ("focal", "centre", "radial", "tangential", "readout")
-KEPT = "the frames tracked so far and their map are kept in the run folder"
+KEPT = "the frames seen so far, if any, and their map are kept in the run folder"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

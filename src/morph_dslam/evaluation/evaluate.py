@@ -157,7 +157,8 @@ def evaluate_force(
     run : a run folder, or a run in memory.
     curve : a file, see `load_curve`, or a curve in memory.
     column : of the file, where it has several columns of forces.
-    reaction : "SET", "SET:x", "SET:+x" or "SET:-x", support and direction; see `force_error` for what is taken without them.
+    reaction : "SET", "SET:x", "SET:+x" or "SET:-x", support and direction; see `force_error` for what is taken without
+        them.
 
     Returns
     -------

@@ -21,6 +21,7 @@ from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.points import MaterialError, millimetres
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
+from morph_dslam.slam.map_files import is_metric_map
 
 Array = NDArray[np.float64]
 
@@ -175,6 +176,10 @@ def relative_error(estimate: Trajectory, truth: Trajectory, interval: float, sca
 
 #: The relative error is taken over motions this long, seconds, where the trajectory allows it.
 INTERVAL = 1.0
+SCALE_UNKNOWN = (
+    "the scale of the run's map is unknown, because one camera cannot measure lengths: there is no ate_se3_mm, and "
+    "ate_sim3_mm is what the best scale leaves (truth = scale x estimate)"
+)
 DPI = 110
 TRUTH, ESTIMATE = "#1b1f24", "#b4530a"
 
@@ -187,7 +192,8 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
 
     Parameters
     ----------
-    run : a run folder with ``trajectory.txt``, any trajectory file, or a trajectory in memory.
+    run : a run folder with ``trajectory.txt``, any trajectory file, or a trajectory in memory. If the map beside
+        ``trajectory.txt`` has no known scale, ``se3`` is None.
     truth : a trajectory or its file.
 
     Returns
@@ -198,8 +204,8 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     ------
     EvaluationError
         If the run has no trajectory, or it and the truth do not overlap in time.
-    TrajectoryError
-        If one of them cannot be read.
+    TrajectoryError, MapError
+        If one of them, or the run's map, cannot be read.
     """
     if isinstance(run, Trajectory):
         path, loaded = None, run
@@ -217,6 +223,9 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     }
     errors = {}
     for name, with_scale in (("se3", False), ("sim3", True)):
+        if not with_scale and path is not None and not _is_in_metres(path):
+            figures[name] = None
+            continue
         absolute = absolute_error(estimate, expected, with_scale)
         scale = absolute.truth_from_estimate.scale
         relative = relative_error(estimate, expected, figures["relative_interval_s"], scale)
@@ -240,6 +249,12 @@ def _trajectory_file(path: Path) -> Path:
     return path
 
 
+def _is_in_metres(path: Path) -> bool:
+    """Whether a trajectory's lengths may be metres: not those of a run whose map has no known scale."""
+    rigid_map = path.with_name("map.h5")
+    return path.name != "trajectory.txt" or not rigid_map.is_file() or is_metric_map(rigid_map)
+
+
 def _interval(trajectory: Trajectory) -> float:
     """`INTERVAL`, less for a short trajectory, and at least the time between poses."""
     times = trajectory.timestamps
@@ -247,11 +262,13 @@ def _interval(trajectory: Trajectory) -> float:
 
 
 def trajectory_line(figures: dict[str, Any]) -> str:
-    """The one line that sums up an evaluation."""
+    """The line that sums up an evaluation, below a note where the scale of the run is unknown."""
     rigid, similar = figures["se3"], figures["sim3"]
+    without_scale = np.nan if rigid is None else rigid["absolute_mm"]["rmse"]
+    note = "" if rigid is not None else f"note: {SCALE_UNKNOWN}\n"
     return (
-        f"pairs={figures['n_pairs']}/{figures['n_poses']} "
-        f"ate_se3_mm={rigid['absolute_mm']['rmse']:.2f} ate_sim3_mm={similar['absolute_mm']['rmse']:.2f} "
+        f"{note}pairs={figures['n_pairs']}/{figures['n_poses']} "
+        f"ate_se3_mm={without_scale:.2f} ate_sim3_mm={similar['absolute_mm']['rmse']:.2f} "
         f"scale={similar['scale']:.4f} rpe_mm={similar['relative_mm']['rmse']:.2f} "
         f"rpe_deg={similar['relative_deg']['rmse']:.3f}"
     )

@@ -142,9 +142,11 @@ def parse_camera(content: object, where: str) -> Camera:
         ) from error
     intrinsics = (values.width, values.height, values.fx, values.fy, values.cx, values.cy)
     try:
-        return Camera(*intrinsics, tuple(values.distortion), cast(LensModel, values.lens), values.readout_s)
+        camera = Camera(*intrinsics, tuple(values.distortion), cast(LensModel, values.lens), values.readout_s)
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
+    camera.check_focal_length(where)
+    return camera
 
 
 def save_camera(path: Path, camera: Camera) -> None:

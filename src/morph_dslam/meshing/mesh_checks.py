@@ -63,16 +63,24 @@ def _check_arrays(mesh: Mesh) -> None:
 
 def check_size(mesh: Mesh) -> None:
     """Refuse a mesh of a size that no object has here: its unit is probably wrong; raises StudyError."""
-    extent = np.ptp(mesh.nodes, axis=0)
+    check_extent(np.ptp(mesh.nodes, axis=0), "the mesh")
+
+
+def check_extent(extent: NDArray[np.float64], what: str) -> None:
+    """The same of an object's lengths along the axes (3,), metres; ``what`` it is begins the message."""
     diagonal = float(np.linalg.norm(extent))
     if SMALLEST <= diagonal <= LARGEST:
         return
-    size = " x ".join(f"{length:.3g}" for length in extent)
     guess = "smaller one such as mm" if diagonal > LARGEST else "larger one such as m"
     raise StudyError(
-        f"the mesh measures {size} m, which is hardly meant: its unit of length is probably wrong; "
+        f"{what} measures {described_extent(extent)} m, which is hardly meant: its unit of length is probably wrong; "
         f"declare the unit in which it was drawn (a {guess})"
     )
+
+
+def described_extent(extent: NDArray[np.float64]) -> str:
+    """Lengths along the axes (3,) for people, in their unit."""
+    return " x ".join(f"{length:.3g}" for length in extent)
 
 
 def _check_orientation(mesh: Mesh) -> None:

@@ -36,7 +36,8 @@ _VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step")
 def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     """Read a mesh file, or mesh the volume that a surface or a STEP file describes.
 
-    Raises StudyError if the kind of file or the unit is not known, or the file is damaged.
+    Raises StudyError if the kind of file or the unit is not known, the file is damaged, or the size of cells goes with
+    no body of its extent.
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     if size is not None and kind not in (*SURFACES, ".step"):
         raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
     if kind in SURFACES:
-        return mesh_surface_file(path, None if size is None else size / scale).scaled(scale)
+        return mesh_surface_file(path, scale, size)
     if kind == ".step":
         return mesh_step_file(path, unit, None if size is None else size * 1e3).scaled(1e-3)
     mesh = _mesh_from_inp(read_inp(path)) if kind == ".inp" else _read_with_meshio(path)

@@ -24,12 +24,15 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
+from morph_dslam.meshing.mesh_checks import check_extent, described_extent
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: Endings of the files that are read.
 SURFACES = (".stl", ".obj", ".ply")
+#: More cells than anyone solves on: their size is a mistake, and meshing them would take for ever.
+MOST_CELLS = 10_000_000
 #: No header of a .ply file has more.
 MOST_HEADER_LINES = 10_000
 
@@ -187,16 +190,18 @@ def _volume_mesh(content: Any, path: Path) -> Mesh:
     return Mesh(nodes, mesh.blocks, cell_sets=cell_sets, surfaces=surfaces).without_unused_nodes()
 
 
-def mesh_surface_file(path: Path, size: float | None) -> Mesh:
-    """Fill a closed surface with tetrahedra; file units.
+def mesh_surface_file(path: Path, unit: float, size: float | None) -> Mesh:
+    """Fill a closed surface with tetrahedra; the mesh is in metres.
 
-    Raises StudyError if the surface is unreadable, not closed, or cannot be filled.
+    Raises StudyError if the surface is unreadable, not closed, or cannot be filled, or the size of cells goes with no
+    body of its extent.
 
     Parameters
     ----------
     path : .stl, .obj or .ply file.
-    size : longest edge of a cell, file units: the surface is meshed anew between its sharp edges. None keeps
-        the triangles of the file, as scans and sculpted surfaces want it.
+    unit : that of its coordinates, metres.
+    size : longest edge of a cell, metres: the surface is meshed anew between its sharp edges. None keeps the
+        triangles of the file, as scans and sculpted surfaces want it.
 
     Returns
     -------
@@ -205,9 +210,29 @@ def mesh_surface_file(path: Path, size: float | None) -> Mesh:
     """
     surface = read_surface(path)
     check_watertight(surface, path)
+    if size is not None:
+        a, b, c = unit * surface.points[surface.triangles].transpose(1, 0, 2)
+        volume = float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
+        area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+        _check_cell_size(path, unit * np.ptp(surface.points, axis=0), volume, area, size)
     with _quiet():
-        content = _filled(surface) if size is None else _meshed_anew(surface, size)
-    return _volume_mesh(content, path)
+        content = _filled(surface) if size is None else _meshed_anew(surface, size / unit)
+    return _volume_mesh(content, path).scaled(unit)
+
+
+def _check_cell_size(path: Path, extent: Array, volume: float, area: float, size: float) -> None:
+    """Refuse a size of cells that goes with no body of this extent (3,), volume and area; metres.
+
+    Meshing too many cells would take for ever, and ignore an interrupt.
+    """
+    check_extent(extent, str(path))
+    # Equilateral tetrahedra; in a thin wall one on every two triangles of its two sides.
+    count = max(6.0 * np.sqrt(2.0) * volume / size**3, area / (np.sqrt(0.75) * size**2))
+    if count > MOST_CELLS:
+        raise StudyError(
+            f"{path} measures {described_extent(extent)} m: cells of at most size = {1e3 * size:.3g} mm would "
+            f"be some {count:.0e}, more than the {MOST_CELLS:.0e} that are meshed; give a larger size, or another unit"
+        )
 
 
 def _filled(surface: _TriangleSurface) -> Any:
@@ -238,7 +263,8 @@ def _meshed_anew(surface: _TriangleSurface, size: float) -> Any:
 def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
     """Mesh the solids of a STEP file with tetrahedra; in millimetres, which the STEP reader converts to.
 
-    Raises StudyError if the file cannot be read or states another unit, or its solids cannot be meshed.
+    Raises StudyError if the file cannot be read or states another unit, its solids cannot be meshed, or the size of
+    cells goes with no body of their extent.
 
     Parameters
     ----------
@@ -260,8 +286,13 @@ def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
         try:
             geometry = occ.OCCGeometry(str(named))
             low, high = geometry.shape.bounding_box
-            diagonal = float(np.linalg.norm(np.array([high[i] - low[i] for i in range(3)])))
-            content = geometry.GenerateMesh(maxh=size or diagonal / 10.0)
+            extent = np.array([high[i] - low[i] for i in range(3)])
+            if size is not None:
+                area = sum(face.mass for face in geometry.shape.faces)
+                _check_cell_size(path, 1e-3 * extent, 1e-9 * geometry.shape.mass, 1e-6 * area, 1e-3 * size)
+            content = geometry.GenerateMesh(maxh=size or float(np.linalg.norm(extent)) / 10.0)
+        except StudyError:
+            raise
         except Exception as error:  # Netgen and Open CASCADE raise plain Exception
             raise StudyError(f"Netgen could not mesh the solids of {path}: {error}") from error
     return _volume_mesh(content, path)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -13,6 +16,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError
 from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.frame_images import FrameImages, FrameView
 from morph_dslam.slam.mapping import Mapper, do_all
@@ -104,6 +108,8 @@ FORMAT, VERSION = "morph-dslam map", 4
 KEYFRAME_ARRAYS = ("normalized", "camera_from_world", "point_ids", "pixels", "right", "described_ids", "descriptors")
 #: Maps of earlier releases have none.
 LATER_KEYFRAME_ARRAYS = ("depths", "twist")
+#: Lenses whose images of a point are closer are taken for the same, pixels.
+LENSES_ALIKE_PX = 0.5
 TRAJECTORY_ARRAYS = ("timestamps", "world_from_camera", "indices")
 
 
@@ -114,6 +120,8 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
         file.attrs["camera_notes"] = json.dumps(rigid_map.camera_notes)
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
+        file.attrs.update({"distortion": camera.distortion, "lens_model": camera.lens_model})
+        file.attrs["readout_s"] = camera.readout_s
         kept = rigid_map.kept_keyframes
         # Keyframes that were taken out are left out; points that were refer to nothing.
         renumbered = np.zeros(len(rigid_map.keyframes), dtype=np.int64)
@@ -134,40 +142,88 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
 def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Trajectory]:
     """Read a map and the path of the run that made it, which is empty where the file holds none.
 
-    Raises MapError if it is missing, damaged, empty, of another version, or of a camera with other intrinsics.
+    Raises MapError if it is missing, damaged, empty, of another version, or of a camera with other intrinsics or
+    another readout time. Another lens is noted in the map's ``camera_notes``: images may have been undistorted before.
     """
+    with _opened(path) as file:
+        none = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+        path_of_run = [np.asarray(file[f"trajectory/{name}"]) for name in TRAJECTORY_ARRAYS if "trajectory" in file]
+        return _read(path, file, camera), Trajectory(*path_of_run) if path_of_run else none
+
+
+def is_metric_map(path: Path) -> bool:
+    """Whether the lengths of a map are metres; raises MapError if it is missing or damaged, or of another version."""
+    with _opened(path) as file:
+        return RigidMap(float(np.asarray(file.attrs["baseline_px"]))).is_metric
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """The file of a map; MapError if it is none, or what is read from it turns out to be damaged."""
+    if path.is_dir():
+        raise MapError(f"{path} is a folder: give the map in it, {path / 'map.h5'}")
     if not path.is_file():
         raise MapError(f"there is no map {path}")
+    if file_kind(path) == ".ply":
+        raise MapError(f"{path} is a point cloud for viewers, no map: give {path.with_name('map.h5')}")
     try:
         if not is_other_hdf5(path):  # maps of earlier versions have no checksum
             check_checksum(path, FORMAT)
         with h5py.File(path, "r") as file:
-            none = Trajectory(np.empty(0), np.empty((0, 4, 4)))
-            path_of_run = [np.asarray(file[f"trajectory/{name}"]) for name in TRAJECTORY_ARRAYS if "trajectory" in file]
-            return _read(path, file, camera), Trajectory(*path_of_run) if path_of_run else none
+            if file.attrs.get("format") != FORMAT:
+                raise MapError(f"{path} is no map of `morph slam`; give the map.h5 of a run folder")
+            if file.attrs["version"] != VERSION:
+                raise MapError(f"{path} has version {file.attrs['version']}; this release reads {VERSION}: map again")
+            yield file
     except (OSError, KeyError, ValueError) as error:
         raise MapError(
             f"{path} is no map of `morph slam`, or damaged ({error}): copy it again, or map the scene again"
         ) from error
 
 
-def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
-    if file.attrs.get("format") != FORMAT:
-        raise MapError(f"{path} is no map of `morph slam`; give the map.h5 of a run folder")
-    if file.attrs["version"] != VERSION:
-        raise MapError(f"{path} has version {file.attrs['version']}; this release reads {VERSION}: map again")
+def _check_camera(path: Path, file: h5py.File, camera: Camera) -> None:
+    """Refuse a camera with other intrinsics, or another readout time, than that of the map."""
     intrinsics, size = np.asarray(file.attrs["intrinsics"]), tuple(np.asarray(file.attrs["size"]).tolist())
     if size != (camera.width, camera.height) or not np.allclose(intrinsics, camera.intrinsics, rtol=1e-6):
         raise MapError(
             f"{path} was made with fx, fy, cx, cy = {', '.join(f'{x:.2f}' for x in intrinsics)} at "
             f"{size[0]}x{size[1]} pixels: use the camera file it was made with"
         )
+    # Maps of earlier releases do not say with which they were made.
+    readout_s = float(np.asarray(file.attrs.get("readout_s", camera.readout_s)))
+    if not np.isclose(readout_s, camera.readout_s, rtol=1e-6, atol=1e-9):
+        raise MapError(
+            f"{path} was made with readout_s = {readout_s:g}, the camera file has {camera.readout_s:g}: use the camera "
+            "file it was made with, or map the scene again with this one"
+        )
+
+
+def _lens_note(path: Path, file: h5py.File, camera: Camera) -> tuple[str, ...]:
+    """What to say where the map was made with another lens; nothing of maps of earlier releases, which have none."""
+    if "distortion" not in file.attrs:
+        return ()
+    distortion = tuple(np.asarray(file.attrs["distortion"], dtype=float).tolist())
+    of_map = replace(camera, distortion=distortion, lens_model=str(file.attrs["lens_model"]))
+    columns, rows = np.meshgrid(np.linspace(0, camera.width - 1, 17), np.linspace(0, camera.height - 1, 13))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    apart = float(np.linalg.norm(of_map.distort_pixels(pixels) - camera.distort_pixels(pixels), axis=1).max())
+    if apart < LENSES_ALIKE_PX:
+        return ()
+    return (
+        f"{path.name} was made with another lens: its distortion differs from the camera file's by up to {apart:.1f} "
+        "px, which is right only if one of the two recordings was undistorted before",
+    )
+
+
+def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
+    _check_camera(path, file, camera)
     keyframes = file.get("keyframes")
     if not isinstance(keyframes, h5py.Group):
         raise MapError(f"{path} is empty: the run that wrote it never began a map")
     rigid_map = RigidMap(float(np.asarray(file.attrs["baseline_px"])))
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
-    rigid_map.camera_notes = tuple(json.loads(str(file.attrs.get("camera_notes", "[]"))))
+    notes = json.loads(str(file.attrs.get("camera_notes", "[]")))
+    rigid_map.camera_notes = (*notes, *_lens_note(path, file, camera))
     for name in POINT_ARRAYS:
         setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))
     rigid_map.merged_into = np.arange(len(rigid_map.state))

@@ -84,7 +84,8 @@ def run_slam(
     Raises MorphError if an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
     (TrackingError).
     """
-    options, is_model = options or SlamOptions(), map_path is not None and map_path.is_dir()
+    options = options or SlamOptions()
+    is_model = map_path is not None and map_path.is_dir() and not (map_path / "map.h5").is_file()
     if options.extend and map_path is None and trajectory is None:
         raise MapError("--extend needs the map that is to grow: --map run/map.h5")
     if map_path is not None and trajectory is not None:

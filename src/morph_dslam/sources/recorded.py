@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.errors import SourceError
-from morph_dslam.io.file_kinds import IMAGES
+from morph_dslam.io.file_kinds import IMAGES, named_kind
 from morph_dslam.sources.frames import (
     ASSUMED_FPS,
     DepthScale,
@@ -125,8 +125,23 @@ def numbered_images(folder: Path) -> dict[int, Path]:
             )
         images[number] = path
     if not images:
-        raise SourceError(f"{folder} holds no images ({', '.join(IMAGES)})")
+        raise SourceError(f"{folder} holds no images ({', '.join(IMAGES)}){_hint(folder)}")
     return dict(sorted(images.items()))
+
+
+def _hint(folder: Path) -> str:
+    """What to give instead of a folder without images, for the end of a sentence: one of its subfolders, if it has."""
+    folders = sorted(path for path in folder.iterdir() if path.is_dir())
+    counts = {path: sum(named_kind(file) in IMAGES for file in path.iterdir()) for path in folders}
+    inner = [path for path in folders if counts[path]]
+    if not inner:
+        return ""
+    found = ", ".join(f"{path.name} ({counts[path]} images)" for path in inner)
+    colour = next((path for path in inner if "depth" not in path.name.lower()), inner[0])
+    return (
+        f"; there are some in {found}: give {colour}, or, to use depth images too, write the lists rgb.txt and "
+        "depth.txt of TUM's layout (docs/sources.md)"
+    )
 
 
 def image_folder(folder: Path, first: int | None = None, last: int | None = None) -> RecordedFrames:

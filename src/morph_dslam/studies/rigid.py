@@ -7,15 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.errors import StudyError
+from morph_dslam.meshing.mesh_checks import check_extent, described_extent
 from morph_dslam.meshing.netgen_meshing import read_surface
 from morph_dslam.meshing.surface_repair import refined_surface, repaired_surface
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.studies.problem import announce
 from morph_dslam.studies.provenance import mesh_hash, versions
 from morph_dslam.units import to_si
 
 #: Edges of the model are at most this share of the diagonal long: a picture is drawn as flat within each triangle.
 LONGEST_EDGE = 1.0 / 24.0
+#: The diagonal of an object that registration would call unusually small, metres.
+UNUSUALLY_SMALL = 0.005
 
 
 def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None) -> ReducedModel:
@@ -33,14 +37,20 @@ def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None
     Raises
     ------
     StudyError
-        If the file cannot be read, describes no surface, or the unit is not one of length.
+        If the file cannot be read, describes no surface, or the unit is not one of length, or so that no object has
+        this size.
     """
     path, scale = Path(surface), to_si(1.0, unit, "length")
     found = read_surface(path)
+    extent = scale * np.ptp(found.points, axis=0)
+    check_extent(extent, str(path))
     try:
         points, triangles, repairs = repaired_surface(found.points, found.triangles)
     except StudyError as error:
         raise StudyError(f"{path} describes no surface: {error}; save it again as a triangulated surface") from error
+    if np.linalg.norm(extent) < UNUSUALLY_SMALL:
+        size = described_extent(1e3 * extent)
+        announce(f"warning: {path} measures {size} mm; if that is not so, '{unit}' is not the unit it was drawn in")
     points, triangles = refined_surface(points, triangles, LONGEST_EDGE * float(np.linalg.norm(np.ptp(points, axis=0))))
     none = np.empty(0)
     constant = ParameterFunctions(none, none, np.zeros((1, 0), dtype=np.int64), np.ones((1, 1)))
