@@ -9,7 +9,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from morph_dslam.errors import StudyError
+from morph_dslam.geometry import fit_similarity
 from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
@@ -31,6 +34,8 @@ from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 FEWEST_HELD_OUT = 4
 #: Responses to unknown loads that are off by more than this share are not to be trusted.
 LARGEST_RESPONSE_ERROR = 0.1
+#: A displacement that is a smaller share of the body's size is none.
+UNSTRAINED = 1e-7
 UNSURE_LOADS = (
     "responses to unknown loads are off by {:.0f} % between the states where they are known: narrow the ranges of the "
     "parameters"
@@ -88,10 +93,23 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         model = replace(model, unknown_loads=loads)
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
-    if found := locking_warnings(chosen):
+    if found := [*locking_warnings(chosen), *_unstrained(snapshots)]:
         model.certificate["warnings"] = found
     save_model(output, model)
     return model
+
+
+def _unstrained(snapshots: Snapshots) -> list[str]:
+    """A sentence if every solution only moves the body without deforming it."""
+    nodes, moves = snapshots.mesh.nodes, [group[0].fields["displacement"] for group in snapshots.training]
+    size, largest = float(np.linalg.norm(np.ptp(nodes, axis=0))), max(float(np.abs(move).max()) for move in moves)
+    if not largest > UNSTRAINED * size:
+        return []
+    for move in moves:
+        fit = fit_similarity(nodes, nodes + move, with_scale=False)
+        if np.abs(fit.apply(nodes) - nodes - move).max() > UNSTRAINED * max(size, largest):
+            return []
+    return ["no solution strains the body, all move it as if it were rigid: is a support missing?"]
 
 
 def _read(study: str | Path | Study) -> tuple[Study, str]:
