@@ -7,6 +7,8 @@ import pytest
 
 from morph_dslam import SimulatedSequence, Tracker, TrackerOptions, register_landmarks
 from morph_dslam.cli import main
+from morph_dslam.tracking.drawing import AugmentedView
+from morph_dslam.tracking.estimator import State
 
 BOX = """
 v 0 0 0\nv 80 0 0\nv 0 60 0\nv 80 60 0\nv 0 0 50\nv 80 0 50\nv 0 60 50\nv 80 60 50
@@ -82,3 +84,22 @@ def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, ca
     ):
         assert main([*command, *option, "-o", str(folder / "other")]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_the_edges_that_are_seen_are_drawn(folder):
+    """In pose 0 of the scene, of the corner that is nearest to the camera three edges run through the drawing."""
+    sequence = SimulatedSequence(folder / "scene.toml")
+    pose, camera = sequence.camera_from_object[0], sequence.camera
+    view, black = AugmentedView(sequence.model, camera), np.zeros((360, 480, 3), np.uint8)
+    drawn = view.draw(black, State(np.zeros(0), pose), (0.0, 1.0), "")
+    corners = 1e-3 * np.array([[x, y, z] for x in (0, 80) for y in (0, 60) for z in (0, 50)], dtype=float)
+    nearest = corners[np.linalg.norm(pose.apply(corners), axis=1).argmin()]
+    opposite = 1e-3 * np.array([80.0, 60.0, 50.0]) - nearest
+    for axis in range(3):
+        along = np.where(np.arange(3) == axis, opposite, nearest)
+        for share in (0.3, 0.5, 0.7):
+            column, row = np.round(camera.project(pose.apply([nearest + share * (along - nearest)])))[0].astype(int)
+            assert drawn[row - 1 : row + 2, column - 1 : column + 2].min(axis=2).max() > 200
+    # Nor is a face white.
+    faces = camera.project(pose.apply([nearest + 0.4 * (opposite - nearest) * [1, 1, 0]]))[0].round().astype(int)
+    assert drawn[faces[1], faces[0]].max() < 200

@@ -15,12 +15,14 @@ from tqdm import tqdm
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints
 from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
+from morph_dslam.registration.mesh_edges import SPACING, MeshEdges
 from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import Frame, FrameSource
@@ -37,6 +39,8 @@ Array = NDArray[np.float64]
 _HEX = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
 #: A prism as three tetrahedra.
 _PRISM = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
+#: Of edges, blue first.
+EDGE_COLOUR = (245, 245, 245)
 _FORM = re.compile(r"([+-]?)([xyz])=(-?[0-9]*\.?[0-9]+)")
 
 
@@ -216,6 +220,8 @@ class AugmentedView:
         self._rest = model.rest_positions(points)
         self._field = ShownField(model, points, self.show)
         self._arrows = ForceArrows(model) if options.forces else None
+        # A field's colours show how a surface lies; of one that is grey all over, its edges do.
+        self._edges = MeshEdges(self._rest, self._triangles) if self._whole and not model.parameters else None
 
     @property
     def surface_field(self) -> ShownField | None:
@@ -298,6 +304,8 @@ class AugmentedView:
             closed=self._closed,
             bar=self._bar,
         )
+        if self._edges is not None:
+            _draw_edges(drawn, self._edges, state.camera_from_object, self._camera)
         for number, structure in enumerate(self._inner):
             nodes = structure.nodes(state.parameters)
             if discrepancy is not None:
@@ -313,6 +321,15 @@ class AugmentedView:
                 brightness=lambert(vertex_normals(nodes, structure.triangles), LIGHT, AMBIENT),
             )
         return drawn if self._arrows is None else self._arrows.draw(drawn, state, self._camera)
+
+
+def _draw_edges(image: NDArray[np.uint8], edges: MeshEdges, pose: RigidTransform, camera: Camera) -> None:
+    """Draw the edges that are seen into ``image``, each point on them as a dash as long as they are apart."""
+    seen = edges.visible(pose, camera)
+    depths = pose.apply(seen.points)[:, 2:]
+    along = seen.normals[:, ::-1] * [-1.0, 1.0] * (0.5 * edges.size / SPACING * camera.fx / depths)
+    ends = np.stack([seen.pixels - along, seen.pixels + along], axis=1)
+    cv2.polylines(image, list(np.round(ends).astype(np.int32)), False, EDGE_COLOUR, 1, cv2.LINE_AA)
 
 
 def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
