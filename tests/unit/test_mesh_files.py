@@ -330,8 +330,14 @@ def test_a_step_solid_is_meshed_and_its_unit_checked(tmp_path):
     mesh = load_mesh(path, "mm", size=0.004)
     check_mesh(mesh)
     assert cell_volumes(mesh).sum() == pytest.approx(8e-6 - pi * 25e-6 * 0.01, rel=5e-3)
-    assert len(mesh.surfaces) == 7
-    assert sum(len(faces) for faces in mesh.surfaces.values()) == len(mesh.boundary_faces())
+    by_number = {name: faces for name, faces in mesh.surfaces.items() if name.startswith("face_")}
+    assert len(by_number) == 7
+    assert sum(len(faces) for faces in by_number.values()) == len(mesh.boundary_faces())
+    ends = {"x_min": (0, 0.0), "x_max": (0, 0.04), "y_min": (1, 0.0), "y_max": (1, 0.02)}
+    for name, (axis, end) in (ends | {"z_min": (2, 0.0), "z_max": (2, 0.01)}).items():
+        assert mesh.nodes[mesh.surface_nodes(name), axis] == pytest.approx(end, abs=1e-9)
+        assert any(len(faces) == len(mesh.surface(name)) for faces in by_number.values())
+    assert len(mesh.surfaces) == 13
     with pytest.raises(StudyError, match="states that its unit of length is mm, but 'm' is declared"):
         load_mesh(path, "m")
     path.write_text(path.read_text()[:2000])

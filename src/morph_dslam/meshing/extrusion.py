@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces
 from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ def extrusion(
     at_corners = np.full(len(corners), size) if sizes is None else np.minimum(np.asarray(sizes, dtype=float), size)
     points, triangles = _triangles(corners, holes, size, at_corners)
     mesh = _raised(points, triangles, thickness, layers)
-    surfaces = _surfaces(mesh, corners, holes, thickness)
+    surfaces = _surfaces(mesh, corners, holes)
     if cell_type in FIRST_ORDER:
         mesh = to_second_order(mesh, cell_type)
         for number, hole in enumerate(holes, 1):
@@ -190,7 +190,7 @@ def _raised(points: Array, triangles: Indices, thickness: float, layers: int) ->
     return Mesh(nodes, (CellBlock("prism6", np.vstack(cells)),)).without_unused_nodes()
 
 
-def _surfaces(mesh: Mesh, corners: Array, holes: Sequence[Hole], thickness: float) -> dict[str, Indices]:
+def _surfaces(mesh: Mesh, corners: Array, holes: Sequence[Hole]) -> dict[str, Indices]:
     """Boundary faces by name; see `extrusion`."""
     faces = mesh.boundary_faces()
     nodes = mesh.face_nodes(faces, corners_only=True)
@@ -200,7 +200,7 @@ def _surfaces(mesh: Mesh, corners: Array, holes: Sequence[Hole], thickness: floa
     def among(is_on: NDArray[np.bool_]) -> Indices:
         return faces[(is_on | np.isnan(points[:, :, 0])).all(axis=1)]
 
-    found = {"z_min": among(points[:, :, 2] == 0.0), "z_max": among(points[:, :, 2] == thickness)}
+    found = end_surfaces(mesh)
     away = _distances(points[:, :, None, :2], corners, ends)
     upright = np.nanmax(points[:, :, 2], axis=1) > np.nanmin(points[:, :, 2], axis=1)
     for k in range(len(corners)):
@@ -208,9 +208,6 @@ def _surfaces(mesh: Mesh, corners: Array, holes: Sequence[Hole], thickness: floa
     for number, hole in enumerate(holes, 1):
         radii = np.linalg.norm(points[:, :, :2] - hole.centre, axis=2)
         found[f"hole_{number}"] = among(np.abs(radii - 0.5 * hole.diameter) < 1e-3 * hole.diameter)
-    for axis, letter in enumerate("xy"):
-        for name, end in (("min", corners[:, axis].min()), ("max", corners[:, axis].max())):
-            found[f"{letter}_{name}"] = among(np.abs(points[:, :, axis] - end) <= tolerance)
     return {name: faces for name, faces in found.items() if len(faces)}
 
 

@@ -216,6 +216,24 @@ def find_faces(mesh: Mesh, corners: Indices) -> Indices:
     return np.vstack([faces, [[-1, -1]]])[first[ids[len(known) :]]]
 
 
+#: Faces end a mesh along an axis if they are this part of its length there away from its end at most.
+AT_END = 1e-6
+
+
+def end_surfaces(mesh: Mesh) -> dict[str, Indices]:
+    """Boundary faces (f, 2) in the planes where a mesh ends along x, y and z: "x_min", "x_max", ...; those there are."""
+    faces = mesh.boundary_faces()
+    nodes = mesh.face_nodes(faces, corners_only=True)
+    points = np.where((nodes >= 0)[:, :, None], mesh.nodes[nodes], np.nan)
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    found = {}
+    for axis, letter in enumerate("xyz"):
+        for name, end in (("min", low[axis]), ("max", high[axis])):
+            away = np.nanmax(np.abs(points[:, :, axis] - end), axis=1)
+            found[f"{letter}_{name}"] = faces[away <= AT_END * (high[axis] - low[axis])]
+    return {name: ends for name, ends in found.items() if len(ends)}
+
+
 def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:
     """Volume (sheets: area) stretch (m, p) of each cell of a block at its quadrature points; SI.
 

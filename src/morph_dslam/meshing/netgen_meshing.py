@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.mesh_checks import check_extent, described_extent
-from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
+from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces, find_faces
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -168,7 +168,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _volume_mesh(content: Any, path: Path) -> Mesh:
-    """A Netgen mesh as ours: cell sets by material name, surfaces "face_1", ... by face number."""
+    """A Netgen mesh as ours: cell sets by material name, surfaces "face_1", ... by face number, and `end_surfaces`."""
     elements = content.Elements3D().NumPy()
     if not len(elements):
         raise StudyError(
@@ -187,6 +187,7 @@ def _volume_mesh(content: Any, path: Path) -> Mesh:
         for name in set(names.values())
         if name and name != "default"
     }
+    surfaces |= end_surfaces(mesh)
     return Mesh(nodes, mesh.blocks, cell_sets=cell_sets, surfaces=surfaces).without_unused_nodes()
 
 
