@@ -221,7 +221,7 @@ AT_END = 1e-6
 
 
 def end_surfaces(mesh: Mesh) -> dict[str, Indices]:
-    """Boundary faces (f, 2) in the planes where a mesh ends along x, y and z: "x_min", "x_max", ...; those there are."""
+    """Boundary faces (f, 2) in the planes where a mesh ends along an axis: "x_min", "x_max", ..., those there are."""
     faces = mesh.boundary_faces()
     nodes = mesh.face_nodes(faces, corners_only=True)
     points = np.where((nodes >= 0)[:, :, None], mesh.nodes[nodes], np.nan)
