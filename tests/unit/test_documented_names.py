@@ -92,7 +92,7 @@ def test_every_result_of_camera_tracking_is_documented(tmp_path):
 def test_every_key_in_a_table_exists(page, roots):
     known = keys_of(*roots) | {"relative_moduli", "times", "bulk_moduli", "prony", "density"}
     # keys of a material are those of its law; generators are values
-    known |= {"block", "tube", "revolution", "plate", "cylinder", "sphere", "annulus", "true"}
+    known |= {"block", "tube", "revolution", "extrusion", "plate", "cylinder", "sphere", "annulus", "true"}
     n_keys = 0
     for table in re.findall(r"^\| key \|.*\n\|[-|]+\n((?:\|.*\n)+)", PAGES[page], flags=re.MULTILINE):
         for row in table.splitlines():

@@ -43,7 +43,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("cameras", "yaml"): 1,
         ("certificate", "csv"): 1,
         ("export", "csv"): 1,
-        ("record-your-own", "toml"): 1,
+        ("record-your-own", "toml"): 2,
         ("record-your-own", "csv"): 1,
         ("registration-aids", "toml"): 3,
         ("scene-file", "toml"): 2,
@@ -121,6 +121,12 @@ def test_a_recording_of_your_own(tmp_path, monkeypatch):
     study = make_study(tomllib.loads(samples("record-your-own", "toml")[0]))
     assert isinstance(study, SolidStudy)
     assert [parameter.name for parameter in study.model_parameters()] == ["stroke"]
+    notched = tomllib.loads(samples("record-your-own", "toml")[0]) | tomllib.loads(
+        samples("record-your-own", "toml")[1]
+    )
+    mesh = make_study(notched).solid_mesh()
+    assert {"x_min", "x_max", "hole_1", "side_2"} <= set(mesh.surfaces)
+    assert np.ptp(mesh.nodes, axis=0) == pytest.approx([0.08, 0.02, 0.002])
     (tmp_path / "landmarks.csv").write_text(samples("record-your-own", "csv")[0])
     landmarks = load_landmarks(tmp_path / "landmarks.csv")
     scale = np.linalg.norm(np.diff(landmarks.pixels[:2], axis=0)) / np.linalg.norm(

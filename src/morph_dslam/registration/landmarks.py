@@ -21,7 +21,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
-from morph_dslam.model import ReducedModel
+from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.initialization import undistorted_grey
 from morph_dslam.registration.messages import (
     Ambiguity,
@@ -46,10 +46,14 @@ Array = NDArray[np.float64]
 CLICK_PX, POOR_FIT, POOR_SHARE = 0.5, 2.0, 1.0 / 800.0
 #: Standard deviation of landmarks' pixels where they are too few to show it, and the least that is believed.
 UNKNOWN_PX, LEAST_PX = 2.0, 0.1
+#: So many landmarks show whether one of them is wrong: three fit in some pose anyway.
+FEWEST_FOR_FIT = 4
 #: Shares of the object's size: least extent of the landmarks, and how far one may lie off the undeformed surface.
 SPREAD_SHARE, SURFACE_SHARE = 0.12, 0.01
 #: Largest residual (root mean square) as a share of the image's diagonal.
 RESIDUAL_SHARE = 0.005
+#: Both of hints about an object whose edges give its place in the end: they need not be exact, but no mistakes.
+HINT_RESIDUAL_SHARE, HINT_SURFACE_SHARE = 0.02, 0.05
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
 #: Units that meshes come in, metres.
@@ -98,29 +102,20 @@ def register_landmarks(
     if not isinstance(landmarks, Landmarks):
         landmarks = load_landmarks(Path(landmarks))
     bound = bind_landmarks(model, landmarks.points)
-    _check_pixels(camera, landmarks.pixels)
+    check_pixels(camera, landmarks)
     pixels = np.ascontiguousarray(camera.undistort_pixels(landmarks.pixels))
-    estimator = Estimator(model, camera, EstimationOptions(huber_px=3.0, max_iterations=60))
+    estimator = _estimator(model, camera, at_rest)
     shapes = shape_starts(model)
     if at_rest or 2 * len(bound) < len(model.parameters) + 6:
         # Too few landmarks leave the shape at its default; the damped iteration departs no more than it must.
         shapes = [model.default]
-    if at_rest:
-        estimator.box = replace(estimator.box, lower=model.default, upper=model.default)
     starts = list(_starts(shapes, camera, bound, pixels)) if near is None else [near]
-    found = estimator.estimate_from(bound, pixels, np.ones(len(bound)), starts)
-    found = [estimate for estimate in found if np.isfinite(estimate.residuals).all()]
-    if not found:
-        raise RegistrationError(
-            "no pose of the object explains the landmarks: check that points and pixels belong together",
-            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
-        )
+    found = _estimates(estimator, bound, pixels, starts)
     if at_rest:
         found = [_of_pose_alone(estimator, bound, pixels, estimate) for estimate in found]
     best, alternatives = _distinct_minima(model, found, click_px)
-    rms = float(np.sqrt(np.mean(np.sum(best.residuals**2, axis=1))))
-    diagonal = float(np.hypot(camera.width, camera.height))
-    _check_residual(best, rms, RESIDUAL_SHARE * diagonal)
+    rms, diagonal = _rms(best), float(np.hypot(camera.width, camera.height))
+    _check_residual(estimator, bound, pixels, best, np.arange(len(bound)) + 1)
     facts = {
         "from": "landmarks",
         "residual_rms_px": rms,
@@ -154,14 +149,44 @@ def register_landmarks(
 
 def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
     """Bind landmarks (k, 3) to the nearest points of the undeformed surface; see `register_landmarks`."""
-    if len(points) < 4:
+    if len(points) < FEWEST_FOR_FIT:
         raise RegistrationError(
-            f"{len(points)} landmarks are too few to register the object: give at least 4, better "
+            f"{len(points)} landmarks are too few to register the object: give at least {FEWEST_FOR_FIT}, better "
             f"{(len(model.parameters) + 6) // 2 + 3} or more spread over it"
         )
-    size, spread = _extent(model.nodes), _extent(points)
+    surface = on_surface(model, points)
+    check_spread(model, points)
+    return BoundPoints.from_surface(model, surface)
+
+
+def check_at_rest(
+    model: ReducedModel, camera: Camera, points: Array, pixels: Array, numbers: NDArray[np.int64]
+) -> None:
+    """Refuse landmarks of one frame that contradict each other grossly: as hints they need not fit closely.
+
+    Parameters
+    ----------
+    model : of the object.
+    camera : that took the frame.
+    points : (k, 3) on the undeformed object, metres, `FEWEST_FOR_FIT` or more.
+    pixels : (k, 2) where they were seen, without the lens's distortion.
+    numbers : (k,) theirs in the messages.
+    """
+    bound = BoundPoints.from_surface(model, on_surface(model, points, HINT_SURFACE_SHARE))
+    starts = list(_starts([model.default], camera, bound, pixels))
+    estimator = _estimator(model, camera, at_rest=True)
+    best = _estimates(estimator, bound, pixels, starts)[0]
+    _check_residual(estimator, bound, pixels, best, numbers, HINT_RESIDUAL_SHARE)
+
+
+def on_surface(model: ReducedModel, points: Array, share: float = SURFACE_SHARE) -> SurfacePoints:
+    """The points of the undeformed surface nearest to landmarks (k, 3).
+
+    Raises RegistrationError if one is off it by more than a share of the object's size.
+    """
+    size = _extent(model.nodes)
     surface, distances = nearest_surface_points(model.nodes, model.triangles, points)
-    limit = SURFACE_SHARE * size
+    limit = share * size
     worst = int(distances.argmax())
     if distances[worst] > limit:
         x, y, z = 1e3 * points[worst]
@@ -172,12 +197,17 @@ def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
             f"object, at most {1e3 * limit:.1f} mm are allowed: landmarks are points of the "
             f"undeformed object ({ranges} mm){_unit_hint(model, points)}"
         )
+    return surface
+
+
+def check_spread(model: ReducedModel, points: Array) -> None:
+    """Refuse landmarks (k, 3) that are all in one corner of the object."""
+    size, spread = _extent(model.nodes), _extent(points)
     if spread < SPREAD_SHARE * size:
         raise RegistrationError(
             f"the landmarks are {1e3 * spread:.3g} mm apart on an object of {1e3 * size:.3g} mm: spread them "
             f"over all that is seen of it{_unit_hint(model, points)}"
         )
-    return BoundPoints.from_surface(model, surface)
 
 
 def _other_unit(model: ReducedModel, points: Array, least: float) -> WrongUnit | None:
@@ -203,14 +233,36 @@ def _extent(points: Array) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def _check_pixels(camera: Camera, pixels: Array) -> None:
+def check_pixels(camera: Camera, landmarks: Landmarks) -> None:
+    """Refuse landmarks whose pixels are not in the image."""
+    pixels = landmarks.pixels
     outside = ~((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
     if outside.any():
         row = int(np.flatnonzero(outside)[0])
+        frame = "the reference frame" if landmarks.frames is None else f"frame {landmarks.frames[row]}"
         raise RegistrationError(
             f"landmark {row + 1} has the pixel ({pixels[row, 0]:g}, {pixels[row, 1]:g}), outside the "
-            f"{camera.width}x{camera.height} image: give pixels of the reference frame"
+            f"{camera.width}x{camera.height} image: give pixels of {frame}"
         )
+
+
+def _estimator(model: ReducedModel, camera: Camera, at_rest: bool) -> Estimator:
+    estimator = Estimator(model, camera, EstimationOptions(huber_px=3.0, max_iterations=60))
+    if at_rest:
+        estimator.box = replace(estimator.box, lower=model.default, upper=model.default)
+    return estimator
+
+
+def _estimates(estimator: Estimator, bound: BoundPoints, pixels: Array, starts: list[State]) -> list[Estimate]:
+    """What explains landmarks, the best first; raises RegistrationError if nothing does."""
+    found = estimator.estimate_from(bound, pixels, np.ones(len(bound)), starts)
+    found = [estimate for estimate in found if np.isfinite(estimate.residuals).all()]
+    if not found:
+        raise RegistrationError(
+            "no pose of the object explains the landmarks: check that points and pixels belong together",
+            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+        )
+    return found
 
 
 def shape_starts(model: ReducedModel, largest: int = 243) -> list[Array]:
@@ -303,16 +355,66 @@ def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float
     return best, distinct_states(model, best.state, plausible)
 
 
-def _check_residual(best: Estimate, rms: float, limit: float) -> None:
-    lengths = np.linalg.norm(best.residuals, axis=1)
-    worst = int(lengths.argmax())
-    if rms > limit:
+def _rms(estimate: Estimate) -> float:
+    """Root mean square of the landmarks' residuals, pixels."""
+    return float(np.sqrt(np.mean(np.sum(estimate.residuals**2, axis=1))))
+
+
+def _check_residual(
+    estimator: Estimator,
+    bound: BoundPoints,
+    pixels: Array,
+    best: Estimate,
+    numbers: NDArray[np.int64],
+    share: float = RESIDUAL_SHARE,
+) -> None:
+    """Refuse landmarks (k,), which have these numbers, if they do not fit to a share of the image's diagonal."""
+    camera = estimator.camera
+    rms, limit = _rms(best), share * float(np.hypot(camera.width, camera.height))
+    if rms <= limit:
+        return
+    is_shape_known = np.array_equal(estimator.box.lower, estimator.box.upper)
+    wrong = _contradicted(estimator, bound, pixels, limit) if is_shape_known else None
+    if wrong is not None:
+        row, away, agreeing = wrong
         raise RegistrationError(
-            f"the landmarks do not fit the object: their residual is {rms:.1f} px (root mean square, at most "
-            f"{limit:.1f} px), the worst is landmark {worst + 1} with {lengths[worst]:.1f} px; check "
-            "its pixel, the order of the landmarks, the camera file, and that the model reaches this shape",
+            f"landmark {numbers[row]} is {away:.1f} px from where the other {len(bound) - 1} have it, which fit the "
+            f"object to {agreeing:.1f} px (at most {limit:.1f} px): check its point and its pixel",
             RegistrationFailure.LANDMARKS_DO_NOT_FIT,
         )
+    lengths = np.linalg.norm(best.residuals, axis=1)
+    worst = int(lengths.argmax())
+    shape = "the object has its mesh's shape there" if is_shape_known else "the model reaches this shape"
+    more = "; five or more show which of them is wrong" if is_shape_known and len(bound) == FEWEST_FOR_FIT else ""
+    raise RegistrationError(
+        f"the landmarks do not fit the object: their residual is {rms:.1f} px (root mean square, at most "
+        f"{limit:.1f} px), the worst is landmark {numbers[worst]} with {lengths[worst]:.1f} px; check "
+        f"its pixel, the order of the landmarks, the camera file, and that {shape}{more}",
+        RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+    )
+
+
+def _contradicted(
+    estimator: Estimator, bound: BoundPoints, pixels: Array, limit: float
+) -> tuple[int, float, float] | None:
+    """The landmark without which the others fit an object of known shape to the limit; None if there is none.
+
+    Returns
+    -------
+    Its row, how far it is from where the others have it, and how they fit, pixels.
+    """
+    if len(bound) <= FEWEST_FOR_FIT:
+        return None
+    found = []
+    for row in range(len(bound)):
+        others = np.delete(np.arange(len(bound)), row)
+        kept, seen = bound.take(others), np.ascontiguousarray(pixels[others])
+        starts = list(_starts([estimator.model.default], estimator.camera, kept, seen))
+        for estimate in estimator.estimate_from(kept, seen, np.ones(len(kept)), starts)[:1]:
+            there = estimator.camera.project(bound.in_camera(estimate.state))[row]
+            found.append((_rms(estimate), row, float(np.linalg.norm(pixels[row] - there))))
+    agreeing, row, away = min(found, default=(np.inf, 0, 0.0))
+    return (row, away, agreeing) if agreeing <= limit else None
 
 
 def _warnings(

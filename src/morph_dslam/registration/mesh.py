@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.landmarks import UNITS
+from morph_dslam.registration.mesh_notices import NotRefined, Unrefined
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -35,10 +37,10 @@ from morph_dslam.registration.messages import (
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.registration import Axis, Rival
-from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, spread_views
+from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, spread_views, views_of
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.surface_search import laid
-from morph_dslam.registration.texture import Agreement, TextureComparison
+from morph_dslam.registration.texture import FEWEST, Agreement, TextureComparison
 from morph_dslam.registration.view_registration import (
     NO_HINTS,
     TELLING_CHANCE,
@@ -88,6 +90,8 @@ AGAINST = 0.25
 #: best. Images that differ by more than this, pixels, or so many times as much as on another place, speak
 #: against a place.
 N_COMPARED, WORTH_COMPARING, POOR_AGREEMENT_PX, MUCH_WORSE = 4, 0.5, 0.35, 2.0
+#: Where fewer of the points that two images both see look alike, it is not for want of texture that there are few.
+MOSTLY_ALIKE = 0.5
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class MeshRegistration:
         those it would occlude.
     rivals : the next best places, the best first.
     n_explained : points on the surface.
-    rms_px : how far the keyframes' images of the surface agree; None if there was too little to compare.
+    rms_px : how far the keyframes' images of the surface agree; None if they were not compared or not believed.
     axis : about which the surface can be turned without a difference, so that this angle is not known.
     keyframes : those with a pose of their own about the object; None if there was too little to compare, or the images
         do not show its shape.
@@ -112,6 +116,7 @@ class MeshRegistration:
         wall, say, that have its shape in another size; or no image shows any of its outline.
     edges : how much of its edges the keyframes show, if it was found by these or they contradict the points.
     shape_shown : whether the images agree on the surface as they would on no flat one.
+    unrefined : why the images did not refine the place; None if they did, or agree with it.
     """
 
     world_from_object: SimilarityTransform
@@ -126,6 +131,7 @@ class MeshRegistration:
     unconfirmed: bool = False
     edges: EdgeEvidence | None = None
     shape_shown: bool = False
+    unrefined: RegistrationWarning | None = None
 
     @property
     def runner_up(self) -> float:
@@ -144,9 +150,7 @@ class MeshRegistration:
             warnings.append(Ambiguous(Ambiguity.IMAGES_DIFFER, self.rms_px))
         elif self.runner_up > AMBIGUOUS * self.score:
             warnings.append(Ambiguous(Ambiguity.SECOND_PLACE, self.runner_up / self.score))
-        if self.rms_px is None:
-            warnings.append(TooLittleTexture())
-        return tuple(warnings)
+        return tuple(warnings) if self.unrefined is None else (*warnings, self.unrefined)
 
     @property
     def _lacks_edges(self) -> bool:
@@ -202,11 +206,7 @@ def register_mesh(
     places = search.search()
     if hints != NO_HINTS:
         if not places:
-            raise RegistrationError(
-                "no keyframe shows the object's edges where the hints have it: check them and the unit of the mesh, or "
-                "give three landmarks",
-                RegistrationFailure.NOT_FOUND,
-            )
+            raise RegistrationError(_not_found(hints), RegistrationFailure.NOT_FOUND)
         return _by_edges(places, search, points, views, bool(hints.clicks))
     score = 100.0 * places[0].rank if places else 0.0
     by_edges = cache(partial(_by_edges, places, search, points, views))
@@ -228,6 +228,19 @@ def register_mesh(
     informative = 0.0 < there.edges.chance < TELLING_CHANCE and there.edges.gain < AGAINST
     contradicts = informative and there.edges.is_below(AGAINST if found.shape_shown else OUTLINE_SHOWN)
     return replace(found, edges=there.edges) if contradicts else found
+
+
+def _not_found(hints: Hints) -> str:
+    """That an object is not where the hints have it."""
+    said = "no keyframe shows the object's edges where the hints have it"
+    if hints.region is None:
+        return f"{said}: check them and the unit of the mesh, or give three landmarks"
+    frame, box = hints.region
+    sides = ", ".join(f"{side:g}" for side in box)
+    return (
+        f"{said}, in the box ({sides}) of keyframe {frame} and about as large as that: draw it around the whole "
+        "object, with little margin, or leave it out; check the unit of the mesh, or give three landmarks"
+    )
 
 
 def _by_edges(
@@ -253,9 +266,12 @@ def _by_edges(
         unconfirmed=not by_clicks and score < CONFIRMED,
         edges=best.edges,
     )
-    aligned = TextureComparison(nodes, triangles, search.camera).refine(best.place, views, search.scale_std)
-    if aligned is None or aligned.rms_px > POOR_AGREEMENT_PX:
-        return found
+    comparison = TextureComparison(nodes, triangles, search.camera)
+    aligned = comparison.refine(best.place, views, search.scale_std)
+    if aligned is None:
+        return replace(found, unrefined=_why_not_compared(comparison, search, best.place, views))
+    if aligned.rms_px > POOR_AGREEMENT_PX:
+        return replace(found, unrefined=NotRefined(Unrefined.IMAGES_DIFFER, aligned.rms_px))
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
     adjusted = _adjusted(
         replace(found, world_from_object=aligned.place, rms_px=aligned.rms_px, shape_shown=aligned.shows_its_shape),
@@ -263,10 +279,11 @@ def _by_edges(
         nodes.mean(axis=0),
         search.scale_std,
     )
-    there, keyframes = search.at(adjusted.world_from_object), adjusted.keyframes
-    is_exact = keyframes is not None and keyframes.rms_px <= EXACT_PX
-    if keyframes is None or (100.0 * there.rank < score - LOST and not is_exact):
-        return found
+    if adjusted.keyframes is None:
+        return replace(found, unrefined=_why_not_compared(comparison, search, aligned.place, views))
+    there, is_exact = search.at(adjusted.world_from_object), adjusted.keyframes.rms_px <= EXACT_PX
+    if 100.0 * there.rank < score - LOST and not is_exact:
+        return replace(found, unrefined=NotRefined(Unrefined.OFF_EDGES, 100.0 * there.rank))
     if not (aligned.shows_its_shape or is_exact):
         return replace(found, rms_px=aligned.rms_px)
     outline = outline_fit(adjusted.world_from_object, nodes, triangles, asked, search.camera)
@@ -275,6 +292,19 @@ def _by_edges(
         rival for rival in found.rivals if not search.same(rival.world_from_object, adjusted.world_from_object)
     )
     return replace(adjusted, edges=there.edges, outline=outline, rivals=rivals)
+
+
+def _why_not_compared(
+    comparison: TextureComparison, search: EdgeSearch, place: SimilarityTransform, views: Sequence[View]
+) -> RegistrationWarning:
+    """Why too little of the images could be compared with the object at a place."""
+    seeing = views_of(search.edges.nodes, place, views, search.camera, len(views))
+    if len(seeing) < 2:
+        return NotRefined(Unrefined.FEW_KEYFRAMES, len(seeing))
+    compared, alike = comparison.alike(place, views)
+    if compared < FEWEST or alike >= MOSTLY_ALIKE * compared:
+        return TooLittleTexture()
+    return NotRefined(Unrefined.LOOK_DIFFERENT, alike / compared)
 
 
 def _by_points(search: EdgeSearch, points: MapPoints, views: Sequence[View], progress: bool) -> MeshRegistration:
@@ -303,6 +333,8 @@ def _by_points(search: EdgeSearch, points: MapPoints, views: Sequence[View], pro
     if found.rms_px is not None:
         adjustment = KeyframeAdjustment(nodes, triangles, camera, points, views, surface.axis_of_revolution)
         found = _adjusted(found, adjustment, nodes.mean(axis=0), search.scale_std)
+    else:
+        found = replace(found, unrefined=_why_not_compared(comparison, search, found.world_from_object, views))
     outline = outline_fit(found.world_from_object, nodes, triangles, more, camera)
     unconfirmed = found.rms_px is None and any(np.ptp(view.normalized) > 0 for view in views)
     return replace(found, outline=outline, unconfirmed=unconfirmed)
@@ -447,8 +479,22 @@ def register_in_unit(
         if same_size(found.world_from_object.scale):
             return found
         raise RegistrationError(
-            "the object was not found in its size, but one of its shape that is "
-            f"{found.world_from_object.scale:.4g} times as large is there, and the map is metric: correct the "
-            "unit of the study's mesh",
+            _other_size(found.world_from_object.scale, any(len(view.depths) for view in views)),
             RegistrationFailure.WRONG_SIZE,
         ) from None
+
+
+def _other_size(factor: float, has_depth: bool) -> str:
+    """That the object is so many times as large as its mesh in a metric map, by depth images or by a stereo pair."""
+    mesh = "the unit of its mesh (--unit of `morph build --rigid`, or that of the mesh in the study)"
+    metre = (
+        "the scale of the depth images (5000 values a metre in folders of TUM RGB-D, elsewhere often 1000)"
+        if has_depth
+        else "the baseline of the stereo pair"
+    )
+    is_unit = any(same_size(factor * a / b) for a, b in permutations(UNITS.values(), 2))
+    likelier, other = (mesh, metre) if is_unit else (metre, mesh)
+    return (
+        f"the object was not found in its size, but one of its shape that is {factor:.4g} times as large is there, and "
+        f"the map is metric: correct {likelier}, or else {other}"
+    )

@@ -20,7 +20,16 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
+from morph_dslam.registration.landmarks import (
+    FEWEST_FOR_FIT,
+    HINT_SURFACE_SHARE,
+    check_at_rest,
+    check_pixels,
+    check_spread,
+    on_surface,
+)
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
+from morph_dslam.registration.mesh_notices import OnlyInBox
 from morph_dslam.registration.messages import OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
@@ -39,6 +48,8 @@ from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.tracking.anchoring import points_on_object
 
+#: Landmarks in one frame from which a search begins.
+FEWEST_CLICKS = 3
 #: Keyframes in the picture of a registration.
 N_PICTURES = 3
 
@@ -67,16 +78,17 @@ def register(
     landmarks : three or more points of the object in one frame of the map's recording, or more in several frames; or
         the file that has them. They have frame numbers.
     distance : rough distance of the object from the camera, metres; it may be off by half.
-    region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
+    region : number of a keyframe, and left, top, right and bottom of a box around the whole object in it, pixels, with
+        any margin up to half the object's width on each side.
     guess : file that says about where the object is in a frame of the map's recording.
 
     Raises
     ------
     RegistrationError
-        If the object is not found, or a hint names a frame without a pose.
+        If the object is not found, a hint names a frame without a pose, or landmarks cannot be right.
     """
     hints = Hints(
-        () if landmarks is None else _sightings(landmarks, scene),
+        () if landmarks is None else _sightings(landmarks, scene, model, guess is not None),
         distance,
         region,
         None if guess is None else _guessed(Path(guess), scene),
@@ -100,6 +112,8 @@ def register(
     warnings = found.warnings
     if scene.is_metric and not same_size(found.world_from_object.scale):
         warnings += (OtherSize(found.world_from_object.scale),)
+    if region is not None and found.ambiguous:
+        warnings += (OnlyInBox(region[0]),)
     placed = registration_in_map(model, in_map, _keyframes(found, views), facts, warnings, found.axis, scene)
     return replace(placed, rivals=found.rivals)
 
@@ -110,11 +124,18 @@ def _outline_share(found: MeshRegistration) -> float | None:
     return found.outline.share if found.outline.count else None
 
 
-def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sighting, ...]:
-    """Landmarks by frames, with the camera's pose in each."""
+def _sightings(
+    landmarks: Landmarks | str | Path, scene: Scene, model: ReducedModel, has_guess: bool
+) -> tuple[Sighting, ...]:
+    """Landmarks by frames, with the camera's pose in each; raises RegistrationError if they cannot be right."""
     given = landmarks if isinstance(landmarks, Landmarks) else load_landmarks(Path(landmarks))
     if given.frames is None:
         raise RegistrationError("landmarks in a map need the numbers of their frames: a first column 'frame'")
+    check_pixels(scene.camera, given)
+    _check_number(given.frames, has_guess)
+    on_surface(model, given.points, HINT_SURFACE_SHARE)
+    if not has_guess:
+        check_spread(model, given.points)
     pixels = np.ascontiguousarray(scene.camera.undistort_pixels(given.pixels))
     sightings, poses, twists = [], _camera_poses(scene), _camera_velocities(scene)
     for frame in np.unique(given.frames).tolist():
@@ -123,8 +144,25 @@ def _sightings(landmarks: Landmarks | str | Path, scene: Scene) -> tuple[Sightin
         there = pixels[rows]
         if frame in twists:
             there = _at_middle_row(scene, pose, twists[frame], there)
-        sightings.append(Sighting(frame, pose, given.points[rows], np.ascontiguousarray(there)))
+        there = np.ascontiguousarray(there)
+        if len(there) >= FEWEST_FOR_FIT:
+            check_at_rest(model, scene.camera, given.points[rows], there, np.flatnonzero(rows) + 1)
+        sightings.append(Sighting(frame, pose, given.points[rows], there))
     return tuple(sightings)
+
+
+def _check_number(frames: NDArray[np.int64], has_guess: bool) -> None:
+    """Refuse landmarks (k,) in these frames if they are too few to begin from."""
+    if not len(frames):
+        raise RegistrationError("the landmark file has no landmarks: give three or more in one frame")
+    numbers, counts = np.unique(frames, return_counts=True)
+    most = int(counts.argmax())
+    if counts[most] < FEWEST_CLICKS and not has_guess:
+        noun = "landmark" if counts[most] == 1 else "landmarks"
+        raise RegistrationError(
+            f"{counts[most]} {noun} in frame {numbers[most]}, and in no frame more: three or more in one frame are "
+            "needed, or a guess beside them"
+        )
 
 
 def _at_middle_row(
@@ -278,12 +316,12 @@ def registration_line(registration: Registration) -> str:
 
 
 def draw_registration(registration: Registration, scene: Scene) -> NDArray[np.uint8]:
-    """Keyframes of the scene side by side, the object drawn over the lower row, coloured by its height."""
+    """Keyframes of the scene side by side, the object drawn over the lower row, coloured by its z."""
     assert registration.map_registration is not None
     model = registration.model
     nodes = model.positions(model.default)
     world = registration.map_registration.world_from_object.apply(nodes)
-    height = 1e3 * (nodes[:, 2] - nodes[:, 2].min())
+    height = 1e3 * nodes[:, 2]
     columns = []
     for view in spread_views(points_and_views(scene)[1], N_PICTURES):
         local = view.camera_from_world.apply(world)
@@ -294,7 +332,7 @@ def draw_registration(registration: Registration, scene: Scene) -> NDArray[np.ui
             local[:, 2],
             model.triangles,
             height,
-            (0.0, float(height.max())),
+            (float(height.min()), float(height.max())),
             label="z on the object [mm]",
             alpha=0.5,
             brightness=lambert(vertex_normals(local, model.triangles), np.array([-0.4, -0.6, -1.0]), 0.4),

@@ -147,6 +147,14 @@ class TextureComparison:
         share = sum(len(pair.offsets) for pair in measured) / sum(pair.n_compared for pair in measured)
         return Agreement(transform, rms, share, _relief(measured))
 
+    def alike(self, place: SimilarityTransform, views: Sequence[View]) -> tuple[int, int]:
+        """How many points are seen by two views with the object at a place, and how many of them look alike."""
+        views = views_of(self._nodes, place, views, self._camera, MOST_VIEWS)
+        measured = self.measure(
+            [view.normalized for view in views], [camera_from_object(view, place) for view in views]
+        )
+        return sum(pair.n_compared for pair in measured), sum(len(pair.offsets) for pair in measured)
+
     def _step(
         self,
         measured: list[PairDisplacements],

@@ -29,7 +29,15 @@ from morph_dslam.registration.other_views import AskedView, gains_in
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
-from morph_dslam.registration.view_search import EdgeDrawings, InView, hypotheses, map_unit, placed, sizes_and_places
+from morph_dslam.registration.view_search import (
+    EdgeDrawings,
+    InView,
+    hypotheses,
+    map_unit,
+    overlaps,
+    placed,
+    sizes_and_places,
+)
 from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]
@@ -76,6 +84,9 @@ N_UNITS, UNIT_FROM = 9, 4.0
 MANY_CLICKS, N_MEANT = 6, 12
 #: Factor by which a rough distance may be off.
 ROUGH_FACTOR = 1.5
+#: A box that was drawn and that of the object's outline have so much in common, over what they cover together. A margin
+#: of half the object's width on each side leaves a quarter, and the drawings of the search are a little off.
+SAME_BOX = 0.2
 #: A guess is one of so many places to begin from. The others are as far from it as guesses are from what is meant:
 #: standard deviations in pixels, of the distance (log), and of the attitude, radians.
 N_NEAR, NEAR_GUESS_PX, NEAR_GUESS_SIZE, NEAR_GUESS_TURN = 120, 12.0, 0.08, 0.12
@@ -107,7 +118,8 @@ class Hints:
     ----------
     clicks : landmarks in frames whose camera is known.
     distance : rough distance of the object from the camera in the keyframes, metres.
-    region : number of a keyframe, and left, top, right and bottom of a box around the object in it, pixels.
+    region : number of a keyframe, and left, top, right and bottom of a box around the whole object in it, pixels, with
+        any margin up to half the object's width on each side.
     guess : about where it is in a frame whose camera is known.
     """
 
@@ -189,7 +201,7 @@ class EdgeSearch:
         Raises RegistrationError if a hint names what is not there.
         """
         if self._hints.clicks or self._hints.guess is not None:
-            return self._polished(self._fitted_from(self._where_said()))
+            return self._in_box(self._polished(self._fitted_from(self._where_said())))
         found: list[EdgeRegistration] = []
         for number, view in enumerate(self._searched()):
             if number >= N_SEARCHED and found and found[0].rank >= SOMETHING:
@@ -201,7 +213,19 @@ class EdgeSearch:
             # On a dense texture, edges are everywhere and say nothing, in other keyframes neither.
             if found and found[0].edges.chance >= TELLING_CHANCE:
                 break
-        return self._polished(found)
+        return self._in_box(self._polished(found))
+
+    def _in_box(self, found: list[EdgeRegistration]) -> list[EdgeRegistration]:
+        """Those of the places that have the object in the box of the hints."""
+        if self._hints.region is None or not found:
+            return found
+        frame, box = self._hints.region
+        view = self._keyframe(frame)
+        local = [camera_from_object(view, each.place).apply(self.edges.nodes) for each in found]
+        pixels = [self.camera.project(nodes) if nodes[:, 2].min() > 0.0 else np.zeros((1, 2)) for nodes in local]
+        boxes = np.array([np.concatenate([seen.min(axis=0), seen.max(axis=0)]) for seen in pixels])
+        kept = overlaps(boxes, box, self.camera) >= SAME_BOX
+        return [each for each, is_kept in zip(found, kept, strict=True) if is_kept]
 
     def _searched(self) -> list[View]:
         """Keyframes to search: that of the region; or one in the middle, an early, a late one, and the others."""
@@ -368,13 +392,13 @@ class EdgeSearch:
             apart = np.abs(np.log(self.edges.size * camera.fx / sizes / hints.distance))
             sizes = sizes[apart < np.log(ROUGH_FACTOR)]
         if hints.region is not None:
-            # The box's diagonal is that of the drawn outline, which is that of the mesh or less.
-            across = float(np.hypot(right - left, bottom - top))
-            sizes = sizes[(sizes > 0.8 * across) & (sizes < 1.5 * across)]
             places = places[((places > [left, top]) & (places < [right, bottom])).all(axis=1)]
         if not len(places) or not len(sizes):
             return []
         found = hypotheses(self._drawings, self.edges, view, camera, sizes, places)
+        if found is not None and hints.region is not None:
+            # The size is only known from the box of each drawing: a rod that is seen end on has a small one.
+            found = found.chosen(overlaps(found.boxes(), hints.region[1], camera) >= SAME_BOX)
         starts = [] if found is None else self._agreeing(found, view)
         return self._best_in(view, starts, QUICK) + starts[:N_AS_FOUND]
 

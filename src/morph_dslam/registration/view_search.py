@@ -10,7 +10,7 @@ that a cluttered print does not win by its many edges.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -259,6 +259,26 @@ class InView:
         turns = towards.T.reshape(-1, 3, 3) @ about.T.reshape(-1, 3, 3) @ self.drawings.rotations[self.sides[rows]]
         return turns, (self.diameter * self.camera.fx / self.sizes[rows])[:, None] * rays
 
+    def boxes(self) -> Array:
+        """Left, top, right and bottom (n, 4) of the drawn edges, pixels."""
+        angles = 2.0 * np.pi * np.arange(N_TURNS) / N_TURNS
+        c, s = np.cos(angles), np.sin(angles)
+        turns = np.array([[c, -s], [s, c]])
+        turned = np.einsum("xyt,spy->stpx", turns, self.drawings.offsets)
+        ends = np.concatenate([turned.min(axis=2), turned.max(axis=2)], axis=2)
+        return np.tile(self.places, 2) + self.sizes[:, None] * ends[self.sides, self.turns]
+
+    def chosen(self, kept: NDArray[np.bool_]) -> InView:
+        """Those of them that are kept (n,)."""
+        return replace(
+            self,
+            gains=self.gains[kept],
+            sizes=self.sizes[kept],
+            sides=self.sides[kept],
+            turns=self.turns[kept],
+            places=self.places[kept],
+        )
+
     def units(
         self, view: View, points: MapPoints, telling: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -421,6 +441,15 @@ def sizes_and_places(camera: Camera, pixels: Array) -> tuple[Array, Array]:
         return sizes, places[:0]
     count_near = KDTree(pixels).query_ball_point(places, near, return_length=True)
     return sizes, places[np.asarray(count_near) >= FEWEST_POINTS]
+
+
+def overlaps(boxes: Array, box: tuple[float, float, float, float], camera: Camera) -> Array:
+    """What boxes (n, 4) have in common with another one, over what they cover together (n,), inside of the image."""
+    frame = np.tile([float(camera.width), float(camera.height)], 2)
+    many, one = np.clip(boxes, 0.0, frame), np.clip(box, 0.0, frame)
+    common = np.maximum(np.minimum(many[:, 2:], one[2:]) - np.maximum(many[:, :2], one[:2]), 0.0).prod(axis=1)
+    together = (many[:, 2:] - many[:, :2]).prod(axis=1) + (one[2:] - one[:2]).prod() - common
+    return np.asarray(common / np.maximum(together, 1e-9), dtype=np.float64)
 
 
 def map_unit(
