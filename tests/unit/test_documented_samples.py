@@ -118,7 +118,8 @@ def test_study_of_a_shell():
 
 def test_a_recording_of_your_own(tmp_path, monkeypatch):
     """Study and landmarks are read; the program follows dots in a video to a tenth of a pixel."""
-    study = make_study(tomllib.loads(samples("record-your-own", "toml")[0]))
+    whole, notched = map(tomllib.loads, samples("record-your-own", "toml"))
+    study = make_study(whole)
     assert isinstance(study, SolidStudy)
     assert [parameter.name for parameter in study.model_parameters()] == ["stroke"]
     notched = tomllib.loads(samples("record-your-own", "toml")[0]) | tomllib.loads(
