@@ -122,10 +122,9 @@ def test_a_recording_of_your_own(tmp_path, monkeypatch):
     study = make_study(whole)
     assert isinstance(study, SolidStudy)
     assert [parameter.name for parameter in study.model_parameters()] == ["stroke"]
-    notched = tomllib.loads(samples("record-your-own", "toml")[0]) | tomllib.loads(
-        samples("record-your-own", "toml")[1]
-    )
-    mesh = make_study(notched).solid_mesh()
+    other = make_study(whole | notched)
+    assert isinstance(other, SolidStudy)
+    mesh = other.solid_mesh()
     assert {"x_min", "x_max", "hole_1", "side_2"} <= set(mesh.surfaces)
     assert np.ptp(mesh.nodes, axis=0) == pytest.approx([0.08, 0.02, 0.002])
     (tmp_path / "landmarks.csv").write_text(samples("record-your-own", "csv")[0])
