@@ -146,7 +146,7 @@ def load_run(folder: str | Path) -> Run:
         raise
     except Exception as error:
         # h5py raises half a dozen types on damaged files, RuntimeError and KeyError among them.
-        raise EvaluationError(f"{path} is damaged or cut short ({error}): track again") from error
+        raise EvaluationError(f"{path} is damaged or cut short: track again, or copy it again") from error
     if not len(run.frames):
         raise EvaluationError(f"{path} holds no frames: track again")
     return run

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.file_kinds import file_kind
+from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
 from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
@@ -30,7 +30,6 @@ from morph_dslam.meshing.netgen_meshing import (
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
-_VOLUMES = (".inp", ".msh", ".vtk", ".vtu", ".step")
 
 
 def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
@@ -52,8 +51,8 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     """
     path, scale = Path(path), to_si(1.0, unit, "length")
     kind = file_kind(path)
-    if kind not in _VOLUMES + SURFACES:
-        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(_VOLUMES + SURFACES)}")
+    if kind not in MESHES:
+        raise StudyError(f"{path} is no mesh file that is read; use {', '.join(MESHES)}")
     if size is not None and size <= 0.0:
         raise StudyError(f"a cell size of {size} m cannot be; give a positive length")
     if size is not None and kind not in (*SURFACES, ".step"):

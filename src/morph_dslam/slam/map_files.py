@@ -177,7 +177,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
             yield file
     except (OSError, KeyError, ValueError) as error:
         raise MapError(
-            f"{path} is no map of `morph slam`, or damaged ({error}): copy it again, or map the scene again"
+            f"{path} is no map of `morph slam`, or damaged: copy it again, or map the scene again"
         ) from error
 
 
