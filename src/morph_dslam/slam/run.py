@@ -113,7 +113,7 @@ def run_slam(
             known = read_colmap_model(map_path) if is_model else load_scene(map_path, FrameImages(one_or_two).camera)
         recorded = open_source(images or source) if isinstance(known, Trajectory | ColmapModel) else None
         if progress:
-            print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+            print("preparing (half a minute the first time, when the inner loops are compiled) ...", file=sys.stderr)
         slam, frames = start_slam(stream, one_or_two, options, known, recorded), list[SlamFrame]()
         again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0

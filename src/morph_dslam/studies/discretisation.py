@@ -137,7 +137,7 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
         try:
             solved[index] = finer.solve(kept[index]["dofs"], kept[index]["mu"], lambda: time.monotonic() < end)
         except OutOfTime:
-            left_out = f"{len(chosen) - len(solved)} were left out: they would take more than {_LIMIT}"
+            left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
             break
         except SolverError as error:
             left_out = f"one was left out: {error}"

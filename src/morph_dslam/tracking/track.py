@@ -180,7 +180,7 @@ def new_session(placed: Sequence[PlacedObject], source: Iterable, *arguments: An
 
 def warm_up(placed: Sequence[PlacedObject]) -> None:
     """Compile the inner loops by the reference frame, so that the first frame takes no longer than the others."""
-    print("preparing: compiling the inner loops (half a minute the first time) ...", file=sys.stderr)
+    print("preparing (half a minute the first time, when the inner loops are compiled) ...", file=sys.stderr)
     images = [cv2.cvtColor(i.grey, cv2.COLOR_GRAY2BGR) if isinstance(i, Image) else i for i in placed[0].images]
     instants = [tuple(Frame(n, float(n), np.asarray(i, dtype=np.uint8)) for i in images) for n in range(2)]
     for _ in new_session(placed, instants):
