@@ -5,8 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from morph_dslam import SimulatedSequence, Tracker, TrackerOptions, register_landmarks
+from morph_dslam import SimulatedSequence, Tracker, TrackerOptions, load_model, register_landmarks
+from morph_dslam.camera import Camera
 from morph_dslam.cli import main
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.registration.messages import LandmarksTurnedAway
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import State
 
@@ -84,6 +88,21 @@ def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, ca
     ):
         assert main([*command, *option, "-o", str(folder / "other")]) == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("mirrored", "expected"), [(False, []), (True, [6])])
+def test_landmarks_on_the_back_are_said_to_be(folder, mirrored, expected):
+    """All on the upper face, which the camera looks at; y the other way fits as well, with the face turned away."""
+    model, camera = load_model(folder / "box.morph"), Camera(480, 360, 3000.0, 3000.0, 239.5, 179.5)
+    points = 1e-3 * np.array(
+        [[0, 0, 50], [80, 0, 50], [80, 60, 50], [0, 60, 50], [40, 0, 50], [30, 20, 50]], dtype=float
+    )
+    pose = RigidTransform(rotation_exp(np.array([np.pi + 0.05, 0.0, 0.0])), np.array([-0.04, 0.03, 1.5]))
+    pixels = camera.project(pose.apply(points))
+    if mirrored:
+        points = points * [1.0, -1.0, 1.0] + [0.0, 0.06, 0.0]
+    found = register_landmarks(model, camera, Landmarks(points, pixels)).warnings
+    assert [warning.turned_away for warning in found if isinstance(warning, LandmarksTurnedAway)] == expected
 
 
 def test_the_edges_that_are_seen_are_drawn(folder):

@@ -23,6 +23,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.initialization import undistorted_grey
+from morph_dslam.registration.landmark_sides import turned_away
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -143,7 +144,7 @@ def register_landmarks(
         facts["corrected_by_outline"] = not notes
         covariance = covariance if notes else best.covariance
     warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px)
-    warnings = (*warnings, *notes)
+    warnings = (*warnings, *notes, *turned_away(model, best.state, landmarks.points))
     return Registration(model, best.state, covariance, facts=facts, warnings=warnings, alternatives=alternatives)
 
 

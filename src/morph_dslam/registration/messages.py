@@ -102,6 +102,24 @@ class PoorFit(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class LandmarksTurnedAway(RegistrationWarning):
+    """The camera would see the landmarks through the object.
+
+    Attributes
+    ----------
+    turned_away : number of landmarks on faces that are turned away from the camera.
+    n_landmarks : of all.
+    """
+
+    template: ClassVar[str] = (
+        "{turned_away} of {n_landmarks} landmarks are on sides of the object that are turned away from the camera: the "
+        "points are mirrored (rows of an image count downwards, y of a drawing mostly upwards), or on its back"
+    )
+    turned_away: int
+    n_landmarks: int
+
+
+@dataclass(frozen=True)
 class AtBound(RegistrationWarning):
     """A parameter ends at a bound of its range.
 
