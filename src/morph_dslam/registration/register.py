@@ -336,6 +336,7 @@ def draw_registration(registration: Registration, scene: Scene) -> NDArray[np.ui
             label="z on the object [mm]",
             alpha=0.5,
             brightness=lambert(vertex_normals(local, model.triangles), np.array([-0.4, -0.6, -1.0]), 0.4),
+            caption=f"frame {view.frame}",
         )
         columns.append(np.vstack([image, drawn]))
     return np.hstack(columns)
