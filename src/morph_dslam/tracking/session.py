@@ -179,6 +179,6 @@ class SynchronizedFrames:
                 numbers = ", ".join(str(frame.index) for frame in frames)
                 raise SourceError(
                     f"the cameras' recordings do not go together: frames {numbers} come at the same time; number "
-                    "what was taken at one instant alike, or if one begins later, give --range from where all have begun"
+                    "what was taken at one instant alike, or if one begins later, give --range from where all begin"
                 )
             yield frames
