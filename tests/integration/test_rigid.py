@@ -10,6 +10,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.cli import main
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.registration.messages import LandmarksTurnedAway
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import State
@@ -67,12 +68,19 @@ def test_the_pose_alone_is_tracked(folder, use_outline):
     assert max(errors) < 0.25e-3
 
 
-def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, capsys):
-    sequence, run = folder / "seq", folder / "run"
+@pytest.fixture(scope="module")
+def command(folder):
+    """Tracks the recording; the run is in the folder."""
+    sequence = folder / "seq"
     assert main(["simulate", str(folder / "scene.toml"), "-o", str(sequence)]) == 0
     files = ["--camera", str(sequence / "camera.yaml"), "--landmarks", str(sequence / "landmarks.csv")]
     command = ["track", str(sequence / "frames"), "--model", str(folder / "box.morph"), *files]
-    assert main([*command, "-o", str(run)]) == 0
+    assert main([*command, "-o", str(folder / "run")]) == 0
+    return command
+
+
+def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, command, capsys):
+    run = folder / "run"
     summary = json.loads((run / "summary.json").read_text())
     # Twelve frames do not show the camera, which is said; they do not accuse the right one.
     assert (summary["n_tracked"], [notice["kind"] for notice in summary["notices"]]) == (12, ["remark"])
@@ -88,6 +96,19 @@ def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, ca
     ):
         assert main([*command, *option, "-o", str(folder / "other")]) == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("command")
+def test_the_path_of_the_camera_about_the_object_is_evaluated(folder, tmp_path, capsys):
+    sequence = SimulatedSequence(folder / "scene.toml")
+    poses = np.array([pose.inverse.matrix for pose in sequence.camera_from_object])
+    save_trajectory(tmp_path / "truth.txt", Trajectory(np.arange(12) / 30.0, poses))
+    assert main(["evaluate", str(folder / "run"), "--trajectory", str(tmp_path / "truth.txt")]) == 0
+    line = capsys.readouterr().out
+    figures = dict(word.split("=") for word in line.split() if "=" in word)
+    assert figures["pairs"] == "12/12"
+    assert float(figures["ate_se3_mm"]) < 1.0
+    assert float(figures["scale"]) == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize(("mirrored", "expected"), [(False, []), (True, [6])])

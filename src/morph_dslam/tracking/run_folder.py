@@ -20,6 +20,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import cross_matrix, rotation_log
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.folders import make_run_folder
+from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
@@ -88,6 +89,7 @@ class RunFolder:
         write_hdf5(path / "result.h5", run)
         write_inner_positions(path / "result.h5", run, self._inner)
         write_csv(path / "frames.csv", run)
+        save_trajectory(path / "trajectory.txt", camera_path(run))
         save_model(path / "model.morph", run.model.without_loads)
         save_camera(path / "camera.yaml", self._camera)
         summary = summarise(run, notices) | (facts or {}) | {"versions": _versions()}
@@ -96,6 +98,14 @@ class RunFolder:
 
         write_plots(path / "plots", run)
         return summary
+
+
+def camera_path(run: RunResults) -> Trajectory:
+    """The camera's poses in the object's frame, in the frames in which the object was found or its place was known."""
+    poses = run.poses()
+    known = np.isfinite(poses).all(axis=(1, 2))
+    from_camera = np.asarray(np.linalg.inv(poses[known]), dtype=np.float64)
+    return Trajectory(np.array(run.timestamps)[known], from_camera, np.array(run.frames, dtype=np.int64)[known])
 
 
 def _versions() -> dict[str, Any]:
