@@ -84,10 +84,10 @@ def load_trajectory(path: Path) -> Trajectory:
 
 def save_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a TUM file that `load_trajectory` and other programs read."""
-    quaternions = Rotation.from_matrix(trajectory.world_from_camera[:, :3, :3]).as_quat(canonical=True)
     lines = ["# timestamp tx ty tz qx qy qz qw"]
-    rows = zip(trajectory.timestamps, trajectory.positions, quaternions, strict=True)
-    for timestamp, position, quaternion in rows:
+    rows = zip(trajectory.timestamps, trajectory.positions, trajectory.world_from_camera[:, :3, :3], strict=True)
+    for timestamp, position, rotation in rows:
+        quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True)
         lines.append(" ".join([f"{timestamp:.6f}", *(f"{x:.9g}" for x in (*position, *quaternion))]))
     path.write_text("\n".join(lines) + "\n")
 
