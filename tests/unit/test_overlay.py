@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.render.overlay import BarPlace, Panel, draw_overlay, paint_surface
-from morph_dslam.render.shading import colour_bar, colour_table, lambert, vertex_normals
+from morph_dslam.render.shading import colour_bar, colour_table, flat_colour_bar, lambert, vertex_normals
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
 
 PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])
@@ -57,6 +57,33 @@ def test_colour_bar_runs_from_high_at_the_top_to_low_at_the_bottom():
     top, bottom = (np.argwhere((bar == colour).all(axis=2)) for colour in (table[255], table[0]))
     assert top[:, 0].max() < 20
     assert bottom[:, 0].min() > 180
+
+
+def test_the_bar_ends_in_a_point_where_values_are_above_the_range():
+    """It is half as wide halfway to its tip, and of the last colour; without such values nothing is beyond its end."""
+    last = colour_table("turbo")[255]
+    plain, pointed = (colour_bar(400, 0.0, 2.0, "stress [MPa]", "turbo", 1.0, above) for above in (False, True))
+    widths = [(bar == last).all(axis=2).sum(axis=1) for bar in (plain, pointed)]
+    assert widths[0][:28].max() == 0
+    assert widths[1][:7].max() == 0
+    assert widths[1][18] == pytest.approx(0.5 * widths[0].max(), abs=2)
+    flat = [flat_colour_bar(400, 0.0, 2.0, "stress [MPa]", "turbo", 1.0, above) for above in (False, True)]
+    assert flat[0].shape == flat[1].shape
+    ends = [np.flatnonzero((bar == last).all(axis=2).any(axis=0)).max() for bar in flat]
+    assert ends[1] > ends[0] + 10
+
+
+def test_values_above_the_range_are_shown_by_the_bar():
+    """The last colour is seen above the bar's end in one picture only."""
+    last, corner = colour_table("turbo")[255], (slice(0, 20), slice(100, None))
+    within, beyond = (draw_overlay(
+        np.zeros((240, 320, 3), np.uint8), np.array([[20.0, 60], [90, 60], [90, 200], [20, 200]]), np.ones(4),
+        TRIANGLES, np.array([0.0, 1.0, value, 0.0]), (0.0, 1.0), label="stress [MPa]",
+    ) for value in (1.0, 3.0))  # fmt: skip
+    assert np.abs(within.astype(int) - beyond).max() > 0
+    assert (np.abs(beyond[corner].astype(int) - last).max(axis=2) < 60).sum() > (
+        np.abs(within[corner].astype(int) - last).max(axis=2) < 60
+    ).sum()
 
 
 def test_the_colour_bar_makes_room_for_the_object_and_does_not_jump():

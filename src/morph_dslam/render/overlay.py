@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 MOST_UNDER_BAR = 0.02
 #: Grey level of a surface where the field has no value.
 NO_VALUE = 130.0
+#: Of values scaled to colours 0 to 255; what is above has the last one.
+LAST_LEVEL = 255.5
 
 
 @njit(cache=True, nogil=True)
@@ -196,7 +198,8 @@ def draw_overlay(
     node_values : (n,) the field in the unit that ``label`` names, for example von Mises stress in MPa; NaN where it
         has no value, which is drawn grey.
     value_range : values at the ends of the colour map; values beyond them take its end colours.
-    label : name and unit of the field, for example "von Mises stress [MPa]"; no colour bar if empty.
+    label : name and unit of the field, for example "von Mises stress [MPa]"; no colour bar if empty. The bar ends in a
+        point where there are values above the range.
     colour_map : a matplotlib colour map.
     alpha : opacity of the surface, 0 to 1.
     brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
@@ -217,8 +220,9 @@ def draw_overlay(
     _draw_outline(result, painted)
     margin = round(0.02 * height)
     if label:
-        upright = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale)
-        flat = flat_colour_bar(round(0.5 * width), float(low), float(high), label, colour_map, scale)
+        above = bool((levels[np.isfinite(levels)] > LAST_LEVEL).any())
+        upright = colour_bar(round(0.6 * height), float(low), float(high), label, colour_map, scale, above)
+        flat = flat_colour_bar(round(0.5 * width), float(low), float(high), label, colour_map, scale, above)
         panel = (bar or BarPlace()).choose(painted, _bar_panels((height, width), margin, upright, flat))
         _blend_panel(result, panel.image, panel.top, panel.left)
     if caption:

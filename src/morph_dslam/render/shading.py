@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import cv2
@@ -85,7 +86,9 @@ def _paste(panel: NDArray[np.uint8], patch: NDArray[np.uint8], top: int, left: i
 
 
 @lru_cache
-def colour_bar(height: int, low: float, high: float, label: str, colour_map: str, scale: float) -> NDArray[np.uint8]:
+def colour_bar(
+    height: int, low: float, high: float, label: str, colour_map: str, scale: float, above: bool = False
+) -> NDArray[np.uint8]:
     """A panel (height, width, 3) with a vertical colour bar, its numbers, and its label along it.
 
     Parameters
@@ -93,6 +96,7 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
     height : of the panel, pixels.
     low, high : values at the bar's ends, in the unit that ``label`` names.
     scale : size of the text, as OpenCV's ``fontScale``.
+    above : whether there are values above ``high``, which have its colour: the bar then ends in a point.
     """
     ticks, numbers = _ticks(low, high, scale)
     label_patch = np.rot90(text_patch(label, scale))
@@ -104,6 +108,8 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
     top, bottom = 2 * margin, height - 1 - 2 * margin
     ramp = np.linspace(255, 0, bottom - top + 1).round().astype(int)
     panel[top : bottom + 1, bar_left : bar_left + bar_width] = colour_table(colour_map)[ramp][:, None]
+    if above:
+        _point(panel, [(bar_left, top), (bar_left + bar_width - 1, top), (bar_left + bar_width // 2, margin // 2)])
     for tick, number in zip(ticks, numbers, strict=True):
         row = round(bottom - (tick - low) / (high - low) * (bottom - top))
         panel[row, bar_left + bar_width : number_left - margin // 2] = 250
@@ -114,7 +120,7 @@ def colour_bar(height: int, low: float, high: float, label: str, colour_map: str
 
 @lru_cache
 def flat_colour_bar(
-    width: int, low: float, high: float, label: str, colour_map: str, scale: float
+    width: int, low: float, high: float, label: str, colour_map: str, scale: float, above: bool = False
 ) -> NDArray[np.uint8]:
     """A panel (height, width, 3) with a horizontal colour bar, its label above and its numbers below it.
 
@@ -124,18 +130,28 @@ def flat_colour_bar(
     label_patch, margin, bar_height = text_patch(label, scale), round(10 * scale), round(24 * scale)
     bar_top = label_patch.shape[0] + 2 * margin
     number_top = bar_top + bar_height + margin
-    inset = margin + max(number.shape[1] for number in numbers) // 2
+    inset = max(margin + max(number.shape[1] for number in numbers) // 2, bar_height)
     width = max(width, label_patch.shape[1] + 2 * inset)
     panel = np.full((number_top + numbers[0].shape[0] + margin, width, 3), BACKGROUND, dtype=np.uint8)
     left, right = inset, width - 1 - inset
     ramp = np.linspace(0, 255, right - left + 1).round().astype(int)
     panel[bar_top : bar_top + bar_height, left : right + 1] = colour_table(colour_map)[ramp][None]
+    if above:
+        middle = bar_top + bar_height // 2
+        _point(panel, [(right, bar_top), (right, bar_top + bar_height - 1), (right + inset - margin // 2, middle)])
     for tick, number in zip(ticks, numbers, strict=True):
         column = round(left + (tick - low) / (high - low) * (right - left))
         panel[bar_top + bar_height : number_top, column] = 250
         _paste(panel, number, number_top, max(column - number.shape[1] // 2, 0))
     _paste(panel, label_patch, margin, inset)
     return panel
+
+
+def _point(panel: NDArray[np.uint8], corners: Sequence[tuple[int, int]]) -> None:
+    """Fill a triangle with the colour that the bar has at its first corner (column, row)."""
+    column, row = corners[0]
+    colour = tuple(int(channel) for channel in panel[row, column])
+    cv2.fillPoly(panel, [np.array(corners, dtype=np.int32)], colour, cv2.LINE_AA)
 
 
 def _ticks(low: float, high: float, scale: float) -> tuple[list[float], list[NDArray[np.uint8]]]:
