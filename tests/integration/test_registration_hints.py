@@ -14,8 +14,7 @@ from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.registration import mesh, register as registering
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, register_mesh
 from morph_dslam.registration.mesh_edges import MeshEdges
-from morph_dslam.registration.mesh_notices import NotRefined, OnlyInBox, Unrefined
-from morph_dslam.registration.messages import TooLittleTexture, read_warning
+from morph_dslam.registration.messages import NotRefined, OnlyInBox, TooLittleTexture, Unrefined, read_warning
 from morph_dslam.registration.register import draw_registration, register
 from morph_dslam.registration.scene import camera_from_object
 from morph_dslam.registration.texture import Agreement, TextureComparison

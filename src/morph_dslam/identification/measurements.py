@@ -300,8 +300,7 @@ class MeasuredForces:
     @cached_property
     def compared(self) -> ReactionInDirection:
         """The reaction with its sign."""
-        states = [self.model.vector(known) for known in self._known]
-        along = np.array([self.reaction.field.value(mu)[0, self.reaction.axis] for mu in states])
+        along = np.array([self.reaction(self.model.vector(known)) for known in self._known])
         return self.reaction.following(along, self.values)
 
     def predict(self, unknowns: Unknowns) -> Array:

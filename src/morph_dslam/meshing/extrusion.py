@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.meshing.generators import with_surfaces
+from morph_dslam.meshing.mesh_checks import MOST_CELLS
 from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces
-from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
+from morph_dslam.meshing.second_order import to_second_order
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -23,8 +25,6 @@ ON_SIDE = 1e-9
 GRADING = 0.25
 #: Longest edge of a cell on a hole, in its radii.
 HOLE_SIZE = 0.4
-#: More cells than these are a mistake.
-MOST_CELLS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,10 @@ def extrusion(
     points, triangles = _triangles(corners, holes, size, at_corners)
     mesh = _raised(points, triangles, thickness, layers)
     surfaces = _surfaces(mesh, corners, holes)
-    if cell_type in FIRST_ORDER:
-        mesh = to_second_order(mesh, cell_type)
-        for number, hole in enumerate(holes, 1):
-            _round(mesh, replace(mesh, surfaces=surfaces).surface_nodes(f"hole_{number}"), hole)
-    mesh = replace(mesh, surfaces=surfaces)
-    return replace(mesh, node_sets={name: mesh.surface_nodes(name) for name in surfaces})
+    mesh = with_surfaces(mesh if cell_type == "prism6" else to_second_order(mesh, cell_type), surfaces)
+    for number, hole in enumerate(holes, 1):
+        _round(mesh, mesh.node_sets[f"hole_{number}"], hole)
+    return mesh
 
 
 def _check(corners: Array, thickness: float, size: float, cell_type: str, layers: int) -> None:
@@ -208,7 +206,7 @@ def _surfaces(mesh: Mesh, corners: Array, holes: Sequence[Hole]) -> dict[str, In
     for number, hole in enumerate(holes, 1):
         radii = np.linalg.norm(points[:, :, :2] - hole.centre, axis=2)
         found[f"hole_{number}"] = among(np.abs(radii - 0.5 * hole.diameter) < 1e-3 * hole.diameter)
-    return {name: faces for name, faces in found.items() if len(faces)}
+    return found
 
 
 def _round(mesh: Mesh, nodes: Indices, hole: Hole) -> None:

@@ -54,7 +54,7 @@ def _unit_grid(kept: NDArray[np.bool_], name: str) -> Mesh:
     return mesh if first_order == name else to_second_order(mesh, name)
 
 
-def _with_surfaces(mesh: Mesh, surfaces: dict[str, Indices]) -> Mesh:
+def with_surfaces(mesh: Mesh, surfaces: dict[str, Indices]) -> Mesh:
     """Name surfaces, and the set of nodes of each by the same name; empty ones are left out."""
     mesh = replace(mesh, surfaces={name: faces for name, faces in surfaces.items() if len(faces)})
     return replace(mesh, node_sets={name: mesh.surface_nodes(name) for name in mesh.surfaces})
@@ -280,7 +280,7 @@ def revolution(
     if full:
         grid, coordinates = _closed(grid, around)
     mesh = replace(grid, nodes=_revolved(coordinates, divisions, curve, thickness, angles, collars))
-    return _with_surfaces(mesh, surfaces)
+    return with_surfaces(mesh, surfaces)
 
 
 def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cell_type: str = "hex20") -> Mesh:
@@ -306,7 +306,7 @@ def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cel
     names = {f"{axis}_min": (i, 0) for i, axis in enumerate("xyz")}
     names |= {f"{axis}_max": (i, divisions[i]) for i, axis in enumerate("xyz")}
     mesh = replace(grid, nodes=grid.nodes * (np.array(size) / np.array(divisions)))
-    return _with_surfaces(mesh, _plane_surfaces(grid, names))
+    return with_surfaces(mesh, _plane_surfaces(grid, names))
 
 
 def tube(

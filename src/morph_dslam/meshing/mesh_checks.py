@@ -15,6 +15,8 @@ from morph_dslam.meshing.meshes import Mesh, jacobian_determinants
 Indices = NDArray[np.int64]
 #: Diagonals of the bounding box (metres) beyond which a length unit was probably mistaken.
 LARGEST, SMALLEST = 5.0, 1e-4
+#: More cells than a generator is asked for by intention: no memory holds their factorisation.
+MOST_CELLS = 5_000_000
 
 
 def check_mesh(mesh: Mesh, sets: Iterable[str] = (), regions: Iterable[str] = ()) -> None:

@@ -25,6 +25,7 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.initialization import undistorted_grey
 from morph_dslam.registration.landmark_sides import turned_away
 from morph_dslam.registration.messages import (
+    UNITS,
     Ambiguity,
     Ambiguous,
     AtBound,
@@ -57,8 +58,6 @@ RESIDUAL_SHARE = 0.005
 HINT_RESIDUAL_SHARE, HINT_SURFACE_SHARE = 0.02, 0.05
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
-#: Units that meshes come in, metres.
-UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
 #: Landmarks in another unit must be spread over this share of the object: on a point they lie anywhere.
 LEAST_SPREAD = 0.2
 #: On a sheet landmarks lie in any smaller unit: those spread over less than the first share of it, which
@@ -161,7 +160,7 @@ def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
 
 
 def check_at_rest(
-    model: ReducedModel, camera: Camera, points: Array, pixels: Array, numbers: NDArray[np.int64]
+    model: ReducedModel, camera: Camera, surface: SurfacePoints, pixels: Array, numbers: NDArray[np.int64]
 ) -> None:
     """Refuse landmarks of one frame that contradict each other grossly: as hints they need not fit closely.
 
@@ -169,11 +168,11 @@ def check_at_rest(
     ----------
     model : of the object.
     camera : that took the frame.
-    points : (k, 3) on the undeformed object, metres, `FEWEST_FOR_FIT` or more.
+    surface : the landmarks on the undeformed object, `FEWEST_FOR_FIT` or more.
     pixels : (k, 2) where they were seen, without the lens's distortion.
     numbers : (k,) theirs in the messages.
     """
-    bound = BoundPoints.from_surface(model, on_surface(model, points, HINT_SURFACE_SHARE))
+    bound = BoundPoints.from_surface(model, surface)
     starts = list(_starts([model.default], camera, bound, pixels))
     estimator = _estimator(model, camera, at_rest=True)
     best = _estimates(estimator, bound, pixels, starts)[0]

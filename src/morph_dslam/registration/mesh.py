@@ -25,14 +25,15 @@ from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
-from morph_dslam.registration.landmarks import UNITS
-from morph_dslam.registration.mesh_notices import NotRefined, Unrefined
 from morph_dslam.registration.messages import (
+    UNITS,
     Ambiguity,
     Ambiguous,
+    NotRefined,
     OutlineElsewhere,
     RegistrationWarning,
     TooLittleTexture,
+    Unrefined,
 )
 from morph_dslam.registration.outline_fit import OutlineFit, outline_fit
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence

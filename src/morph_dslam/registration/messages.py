@@ -164,8 +164,10 @@ class OtherSize(RegistrationWarning):
     ratio: float
 
 
-#: Units that landmarks may be in by mistake, in millimetres, which they should be in.
-_UNITS_MM = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0, "micrometres": 1e-3}
+#: Units that meshes come in, metres.
+UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
+#: Those that landmarks may be in by mistake, in millimetres, which they should be in.
+_UNITS_MM = {name: 1e3 * size for name, size in (UNITS | {"micrometres": 1e-6}).items() if name != "millimetres"}
 
 
 @dataclass(frozen=True)
@@ -308,6 +310,62 @@ class TooLittleTexture(RegistrationWarning):
     """The keyframes could not be compared on the object, so that they did not refine its place."""
 
     template: ClassVar[str] = "the keyframes show too little texture on the object to refine its place"
+
+
+class Unrefined(StrEnum):
+    """Why the keyframes' images did not refine an object's place, where its texture is not the reason."""
+
+    FEW_KEYFRAMES = "few_keyframes"
+    LOOK_DIFFERENT = "look_different"
+    IMAGES_DIFFER = "images_differ"
+    OFF_EDGES = "off_edges"
+
+
+_REASONS = {
+    Unrefined.FEW_KEYFRAMES: "only {value:.0f} of them has half of the object or more in its image, and two are needed",
+    Unrefined.LOOK_DIFFERENT: "only {value:.0%} of the points on it look alike in two of them; it shines, something "
+    "else is before it, or it is placed wrong, so look at registration.jpg",
+    Unrefined.IMAGES_DIFFER: "where they agree best they still differ by {value:.2f} px on it, as they do on weak "
+    "texture or if it is placed wrong",
+    Unrefined.OFF_EDGES: "they would move it off its edges, to where its score is {value:.0f}, so that edges alone "
+    "give its place",
+}
+
+
+@dataclass(frozen=True)
+class NotRefined(RegistrationWarning):
+    """The keyframes' images did not refine the object's place, though they may have texture.
+
+    Attributes
+    ----------
+    why : the reason.
+    value : the number of keyframes, the share of points, the difference in pixels, or the score.
+    """
+
+    why: Unrefined
+    value: float
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        reason = _REASONS[Unrefined(self.why)].format(value=self.value)
+        return f"the keyframes' images do not refine the object's place: {reason}"
+
+
+@dataclass(frozen=True)
+class OnlyInBox(RegistrationWarning):
+    """A registration that is in doubt was looked for in a box alone.
+
+    Attributes
+    ----------
+    frame : number of the keyframe that the box is in.
+    """
+
+    template: ClassVar[str] = (
+        "the object was looked for only in the box that was given in keyframe {frame}, as about as large as the box: "
+        "draw it around the whole object, with little margin, or leave it out"
+    )
+    frame: int
 
 
 def read_warning(content: Mapping[str, Any]) -> RegistrationWarning:

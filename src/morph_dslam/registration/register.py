@@ -29,8 +29,7 @@ from morph_dslam.registration.landmarks import (
     on_surface,
 )
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
-from morph_dslam.registration.mesh_notices import OnlyInBox
-from morph_dslam.registration.messages import OtherSize
+from morph_dslam.registration.messages import OnlyInBox, OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
     KeyframePose,
@@ -133,7 +132,7 @@ def _sightings(
         raise RegistrationError("landmarks in a map need the numbers of their frames: a first column 'frame'")
     check_pixels(scene.camera, given)
     _check_number(given.frames, has_guess)
-    on_surface(model, given.points, HINT_SURFACE_SHARE)
+    surface = on_surface(model, given.points, HINT_SURFACE_SHARE)
     if not has_guess:
         check_spread(model, given.points)
     pixels = np.ascontiguousarray(scene.camera.undistort_pixels(given.pixels))
@@ -146,7 +145,7 @@ def _sightings(
             there = _at_middle_row(scene, pose, twists[frame], there)
         there = np.ascontiguousarray(there)
         if len(there) >= FEWEST_FOR_FIT:
-            check_at_rest(model, scene.camera, given.points[rows], there, np.flatnonzero(rows) + 1)
+            check_at_rest(model, scene.camera, surface.take(rows), there, np.flatnonzero(rows) + 1)
         sightings.append(Sighting(frame, pose, given.points[rows], there))
     return tuple(sightings)
 

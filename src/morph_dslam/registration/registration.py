@@ -18,9 +18,6 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.notices import Notice
-
-# `read_warning` knows the warnings that have been imported.
-from morph_dslam.registration.mesh_notices import NotRefined as NotRefined, OnlyInBox as OnlyInBox
 from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsewhere, read_warning
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.state import Prior, State, pose_increment

@@ -21,7 +21,7 @@ from morph_dslam.mechanics import contact, couplings, loads, supports
 from morph_dslam.mechanics.rigid_mesh import RigidMesh
 from morph_dslam.meshing import generators as mesh_generators
 from morph_dslam.meshing.extrusion import Hole, extrusion
-from morph_dslam.meshing.mesh_checks import LARGEST, SMALLEST, check_mesh
+from morph_dslam.meshing.mesh_checks import LARGEST, MOST_CELLS, SMALLEST, check_mesh, described_extent
 from morph_dslam.meshing.mesh_files import load_closed_surface, load_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.sections import Angle, LengthUnit, Number, PositiveLength, Section, StudyPath
@@ -29,8 +29,6 @@ from morph_dslam.units import to_si
 
 CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"]
 Count = Annotated[int, Field(ge=1)]
-#: More cells than these are a mistake: no memory holds their factorisation.
-MOST_CELLS = 5_000_000
 #: Units of mesh files, the most usual first, and the diagonal (metres) from which a mesh in one is no surprise.
 _USUAL_UNITS, _LEAST_USUAL = ("mm", "m", "cm", "um"), 2e-3
 
@@ -181,7 +179,7 @@ def check_unit(mesh: Mesh, unit: str, key: str) -> None:
     drawn = diagonal / to_si(1.0, unit, "length")
     better = next((name for name in _USUAL_UNITS if _LEAST_USUAL <= to_si(drawn, name, "length") <= LARGEST), None)
     advice = f'if it was drawn in {better}, write "{better}"' if better else "look at its coordinates"
-    size = " x ".join(f"{length:.3g}" for length in extent)
+    size = described_extent(extent)
     raise StudyError(f'{key}: in "{unit}" the mesh measures {size} m, which is hardly meant; {advice}')
 
 
