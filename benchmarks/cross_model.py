@@ -41,8 +41,7 @@ from morph_dslam.extend.geometry import fit_similarity
 from morph_dslam.extend.models import MaterialPoints, SeparatedField, von_mises
 from morph_dslam.extend.registration import run_registration
 from morph_dslam.extend.slam import run_slam, save_camera
-from morph_dslam.mechanics.point_location import material_points
-from morph_dslam.meshing.cell_types import cell_type
+from morph_dslam.model.cell_types import cell_type
 from morph_dslam.model.reduced_model import spread_over
 from registration_seeds import MODEL, PATH, outcome, scene_text
 from support import keep_model, keep_sequence
@@ -88,12 +87,12 @@ class Twins:
 
     @classmethod
     def of(cls, turned: md.ReducedModel, foreign: md.ReducedModel) -> Twins:
-        """Find the points in the foreign mesh; StudyError where its body is elsewhere."""
+        """Find the points in the foreign mesh; ParameterError where its body is elsewhere."""
         surface = spread_over(turned.nodes, turned.triangles, N_POINTS)
         rest, cells = turned.rest_positions(surface), turned.cells["hex8"]
         centres = MaterialPoints(cells, np.full(cells.shape, 1.0 / 8.0))
         inside = turned.rest_positions(centres)
-        on_foreign, in_foreign = (material_points(foreign, points, APART) for points in (rest, inside))
+        on_foreign, in_foreign = (foreign.points(points, APART) for points in (rest, inside))
         gaps = 1e3 * np.linalg.norm(foreign.rest_positions(on_foreign) - rest, axis=1)
         print(f"undeformed surfaces: mean_mm={gaps.mean():.4f} max_mm={gaps.max():.4f} apart", flush=True)
         slopes = cell_type("hex8").shape_gradients(np.full((1, 3), 0.5))[0]
@@ -151,7 +150,7 @@ def followed(folder: Path, run: Path, refine: bool, video: bool) -> Path:
     run_slam(frames, camera, run / "scan", last=SCAN_END, refine=terms, video=False, overwrite=True)
     if refine:
         camera = run / "scan" / "camera.yaml"
-    registered = run_registration(run / "scan" / "map.h5", MODEL, camera, run / "place")
+    registered = run_registration(run / "scan" / "map.h5", MODEL, camera, run / "place", overwrite=True)
     options = md.TrackOptions(
         frames=frames,
         model=MODEL,

@@ -120,7 +120,7 @@ def make_large(folder: Path, model: Path) -> None:
             overwrite=True,
             video=False,
         )
-        run_registration(folder / "scan" / "map.h5", model, camera, folder / "registration")
+        run_registration(folder / "scan" / "map.h5", model, camera, folder / "registration", overwrite=True)
 
     keep(folder / "scan", [folder / "scene.toml", model], scan)
 

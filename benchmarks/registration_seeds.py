@@ -220,7 +220,7 @@ def main() -> int:
         mapped(folder, arguments.again == "maps")
         map_path, camera = folder / "scan" / "map.h5", folder / "recording" / "camera.yaml"
         try:
-            registration = run_registration(map_path, MODEL, camera, folder / "registration")
+            registration = run_registration(map_path, MODEL, camera, folder / "registration", overwrite=True)
         except MorphError as error:
             print(f"seed={seed} not registered: {error}", flush=True)
             continue

@@ -65,7 +65,7 @@ def tracked(seed: int, pose: str) -> NDArray[np.float64]:
     folder = recorded(seed)
     mapped(folder, False, last=seal.FROZEN_AT)
     camera, registration = folder / "recording" / "camera.yaml", folder / "registration"
-    registered = run_registration(folder / "scan" / "map.h5", MODEL, camera, registration)
+    registered = run_registration(folder / "scan" / "map.h5", MODEL, camera, registration, overwrite=True)
     summary = track(
         TrackOptions(
             frames=folder / "recording" / "frames",

@@ -139,7 +139,7 @@ def run(arguments: argparse.Namespace) -> None:
     keep_sequence(scene, model, sequence)
     camera, frames = sequence / "camera.yaml", sequence / "frames"
     run_slam(source=frames, camera=camera, output=output / "scan", first=0, last=arguments.frozen_at, overwrite=True)
-    registration = run_registration(output / "scan" / "map.h5", model, camera, output / "registration")
+    registration = run_registration(output / "scan" / "map.h5", model, camera, output / "registration", overwrite=True)
     print(registration_line(registration))
     summary = md.track(
         md.TrackOptions(

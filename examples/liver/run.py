@@ -95,7 +95,7 @@ def track_from_map(folder: Path) -> dict:
     camera, frames = SEQUENCE / "camera.yaml", SEQUENCE / "frames"
     scan, place = OUTPUT / "scan", OUTPUT / "registration"
     run_slam(source=frames, camera=camera, output=scan, first=0, last=FROZEN_AT, overwrite=True)
-    registration = run_registration(scan / "map.h5", MODEL, camera, place)
+    registration = run_registration(scan / "map.h5", MODEL, camera, place, overwrite=True)
     print(registration_line(registration))
     return md.track(
         md.TrackOptions(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite
 from typing import Literal
 
 import cv2
@@ -30,6 +31,8 @@ MOST_ITERATIONS = 50
 LONGEST_READOUT_S = 0.5
 #: The least focal length of a lens that is no fisheye, as a share of the image's side: a view of 157 degrees.
 LEAST_FOCAL_SHARE = 0.1
+#: Sides of images of two sizes have the same ratio up to this part.
+SAME_RATIO = 0.01
 #: Numbers of coefficients of each lens model.
 COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5, 8), "fisheye": (4,)}
 
@@ -159,8 +162,8 @@ class Camera:
     readout_s : seconds from the first row to the last of a rolling shutter, 0 for a global one; negative where the
         last row comes first
 
-    Raises CameraError if the lens model is unknown or takes another number of coefficients, or the readout time is
-    longer than `LONGEST_READOUT_S`.
+    Raises CameraError if the size or the focal lengths are not positive, a number is not finite, the lens model is
+    unknown or takes another number of coefficients, or the readout time is longer than `LONGEST_READOUT_S`.
     """
 
     width: int
@@ -174,6 +177,14 @@ class Camera:
     readout_s: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("width", "height", "fx", "fy"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise CameraError(f"{name} is {getattr(self, name)}: give the camera's in pixels, above 0")
+        if not all(map(isfinite, (self.cx, self.cy, *self.distortion))):
+            raise CameraError(
+                f"cx, cy and distortion are {(self.cx, self.cy, *self.distortion)}: give finite numbers, or calibrate "
+                "the camera anew"
+            )
         model, counts, n = self.lens_model, COUNTS.get(self.lens_model), len(self.distortion)
         if counts is None:
             raise CameraError(f"unknown lens model '{model}'; use one of {', '.join(COUNTS)}")
@@ -205,8 +216,15 @@ class Camera:
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def project(self, points: Array) -> Array:
-        """Pixels (n, 2) of points (n, 3) in the camera frame, metres; NaN for points not in front."""
+        """Pixels (n, 2) of points (n, 3), or (2,) of one (3,), in the camera frame, metres; NaN where not in front.
+
+        Raises CameraError if points have not three coordinates.
+        """
         points = np.ascontiguousarray(points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:  # the compiled loop would read what is not there
+            if points.shape != (3,):
+                raise CameraError(f"points to project have the shape (n, 3), not {points.shape}")
+            return self.project(points[None])[0]
         return _projected(points, self.fx, self.fy, self.cx, self.cy)
 
     def projection_jacobian(self, points: Array) -> Array:
@@ -283,14 +301,48 @@ class Camera:
                     "fx and fy are in pixels, not in millimetres (f in mm times the pixels per mm of the sensor)"
                 )
 
+    def checked_picture(self, image: NDArray, where: str) -> NDArray[np.uint8]:
+        """A picture (h, w, 3) or (h, w) as recorded; one (h, w, 1) becomes (h, w).
+
+        Raises CameraError, whose message begins with ``where``, if it is no such picture or not of the camera's size.
+        """
+        is_array = isinstance(image, np.ndarray)
+        if not is_array or image.dtype != np.uint8 or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
+            given = f"an array {image.shape} of {image.dtype}" if is_array else f"of type {type(image).__name__}"
+            raise CameraError(
+                f"{where} is {given}: give its picture as an array of uint8, {(self.height, self.width, 3)} in blue, "
+                f"green, red, or {(self.height, self.width)} in grey"
+            )
+        self.check_image(image, where)
+        return image[:, :, 0] if image.shape[2:] == (1,) else image
+
+    def check_depth(self, depth: NDArray, where: str) -> None:
+        """Raise CameraError, whose message begins with ``where``, unless it is a depth image of the camera's size."""
+        size, is_array = (self.height, self.width), isinstance(depth, np.ndarray)
+        if not is_array or depth.dtype.kind != "f" or depth.shape != size:
+            given = f"an array {depth.shape} of {depth.dtype}" if is_array else f"of type {type(depth).__name__}"
+            raise CameraError(
+                f"{where} is {given}: give metres as float32, {size} as the picture that it belongs to, NaN where "
+                "nothing was measured"
+            )
+
     def check_image(self, image: NDArray, where: str) -> None:
         """Raise CameraError unless ``image`` (height, width, ...) has the calibrated size."""
         height, width = image.shape[:2]
         if (width, height) != (self.width, self.height):
             raise CameraError(
                 f"{where} is {width}x{height} pixels but the camera file is for {self.width}x{self.height}: "
-                "use the calibration of this camera at this size, or resize the images"
+                f"use the calibration of this camera at this size, or resize the images{self._scaled(width, height)}"
             )
+
+    def _scaled(self, width: int, height: int) -> str:
+        """The intrinsics for images of another size, for the end of a sentence, if their sides have the same ratio."""
+        by = np.array([width / self.width, height / self.height])
+        if abs(by[0] / by[1] - 1.0) > SAME_RATIO:
+            return ""
+        fx, fy, cx, cy = self.intrinsics * np.tile(by, 2) + np.repeat([0.0, 0.5], 2) * (np.tile(by, 2) - 1.0)
+        numbers = f"fx: {fx:.2f}, fy: {fy:.2f}, cx: {cx:.2f}, cy: {cy:.2f}"
+        return f"; of images that were resized, not cut, it is width: {width}, height: {height}, {numbers}"
 
 
 @dataclass(frozen=True)

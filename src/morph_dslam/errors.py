@@ -6,10 +6,30 @@ The command line prints the message alone and exits with status 2. Everything el
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Any
 
 
 class MorphError(Exception):
     """A mistake in the input that the user can mend; the base of all errors raised on purpose."""
+
+
+class ArgumentError(MorphError, TypeError):
+    """A function is given something of another kind than it takes."""
+
+
+def check_kind(value: object, kind: type[Any] | tuple[type[Any], ...], what: str, instead: str) -> None:
+    """Raise ArgumentError unless a value is of a kind.
+
+    Parameters
+    ----------
+    value : the argument.
+    kind : its class, or several.
+    what : the argument's name, for the message.
+    instead : what to give.
+    """
+    if not isinstance(value, kind):
+        shown = repr(value) if isinstance(value, str | int | float | bool | None) else f"of type {type(value).__name__}"
+        raise ArgumentError(f"{what} is {shown}: give {instead}")
 
 
 class StudyError(MorphError):

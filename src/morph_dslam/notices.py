@@ -31,6 +31,9 @@ class Notice:
         """For people."""
         return self.template.format(**vars(self))
 
+    def __str__(self) -> str:
+        return self.text
+
     def content(self) -> dict[str, Any]:
         """The kind, the fields and the text, for a JSON file."""
         return {"kind": self.kind, **asdict(self), "text": self.text}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from math import pi
 
 from morph_dslam.errors import StudyError
@@ -23,6 +24,7 @@ FACTORS: dict[str, dict[str, float]] = {
     "stiffness per area": {"N/m3": 1.0, "N/mm3": 1e9, "Pa/m": 1.0, "MPa/mm": 1e9},
     "time": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
 }
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(1|[A-Za-z]\S*)?\s*")
 
 
 def quantity_of(unit: str) -> str:
@@ -40,6 +42,27 @@ def to_si(value: float, unit: str, quantity: str) -> float:
     if unit not in known:
         raise StudyError(f"'{unit}' is not a unit of {quantity}; use one of {', '.join(known)}")
     return value * known[unit]
+
+
+def read_quantity(text: str, quantity: str) -> float:
+    """A text such as "20 mN" as SI.
+
+    Parameters
+    ----------
+    text : a number and its unit; for a ratio the number alone.
+    quantity : a key of `FACTORS`.
+
+    Raises
+    ------
+    StudyError
+        If the text is something else, or its unit does not measure ``quantity``.
+    """
+    read = _QUANTITY.fullmatch(text)
+    unit = None if read is None else read[2] or ("1" if quantity == "ratio" else None)
+    if read is None or unit is None:
+        units = ", ".join(FACTORS[quantity])
+        raise StudyError(f"'{text}' is not a number with a unit of {quantity} ({units}) behind it")
+    return to_si(float(read[1]), unit, quantity)
 
 
 def from_si(value: float, unit: str, quantity: str) -> float:

@@ -13,7 +13,7 @@ import morph_dslam as md
 from morph_dslam.cli import app as cli
 from morph_dslam.evaluation.model_summary import error_facts, summarise_model
 from morph_dslam.mechanics.solid import SolidOptions
-from morph_dslam.mechanics.solvers.continuation import loaded_state
+from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
 from morph_dslam.studies import discretisation
 from morph_dslam.studies.build import certified_model
 from morph_dslam.studies.defaults import resolve_defaults
@@ -144,3 +144,71 @@ def test_no_estimate_is_the_first_thing_that_is_said(tmp_path: Path, capsys: pyt
     assert cli.main(["info", str(tmp_path / "bar.morph")]) == 0
     _title, _, heading, first, *_ = capsys.readouterr().out.splitlines()
     assert [heading, *first.split()] == ["errors", "total", "error", "not", "estimated"]
+
+
+def test_the_estimate_of_a_shell_is_how_far_plate_theory_is_from_few_elements(tmp_path: Path) -> None:
+    """Linear moments in four triangles miss the square of a uniformly loaded strip; Poisson's ratio is zero."""
+    length, width, thickness, push = 0.1, 0.02, 1e-3, 1e-3
+    content = {
+        "name": "strip",
+        "mesh": {"generator": "plate", "size": ["100 mm", "20 mm"], "divisions": [2, 1], "cells": "tri6"},
+        "shell": {"thickness": "1 mm"},
+        "material": {"young": "1 GPa", "poisson": 0.0},
+        "supports": [{"kind": "clamped", "on": "x_min"}],
+        "loads": [{"kind": "force", "force": ["0 N", "0 N", "push"]}],
+        "parameters": {"push": {"range": ["0 N", f"{push} N"]}},
+        "sampling": {"scheme": "even", "training": 9, "held_out": 6},
+        "solver": {"workers": 1},
+    }
+    study = resolve_defaults(md.make_study(content))
+    snapshots = take_snapshots(study, tmp_path)
+    model = certified_model(snapshots, study.reduction, study.name)
+    entry = discretisation_errors(study, snapshots, model, 0.0)
+    assert entry["method"] == "displacements of order 3 on the same cells"
+    unit = np.zeros((len(model.nodes), 3))
+    unit[:, 0] = -3.0 * (length - model.nodes[:, 0]) ** 2 / length / (width * thickness**2)
+    missing = []
+    for coordinates in entry["coordinates"]:
+        (own,) = (s for s in snapshots.held_out if np.allclose(s.coordinates, coordinates))
+        missing.append(np.linalg.norm(own.fields["stress_top"] - coordinates[0] * unit, axis=1))
+    assert len(missing) == 3
+    assert entry["errors"]["stress_top"]["mean_MPa"] == pytest.approx(1e-6 * np.mean(missing), rel=0.15)
+
+
+def test_finer_elements_find_the_same_homogeneous_state() -> None:
+    """A rubber cube on symmetry planes: its state is homogeneous, so that all elements have the same displacement."""
+    symmetry = [{"kind": "displacement", "on": f"{axis}_min", axis: "0 mm"} for axis in "xyz"]
+    content = {
+        "name": "cube",
+        "mesh": {"generator": "block", "size": ["10 mm", "10 mm", "10 mm"], "divisions": [1, 1, 1]},
+        "materials": {
+            "rubber": {
+                "law": "ogden",
+                "moduli": ["0.4095 MPa", "0.003 MPa", "0.01 MPa"],
+                "exponents": [1.3, 5, -2],
+                "bulk": "422 MPa",
+            }
+        },
+        "supports": [*symmetry, {"kind": "displacement", "on": "z_max", "z": "stroke"}],
+        "parameters": {"stroke": {"range": ["0 mm", "50 mm"]}},
+    }
+    study = md.make_study(content)
+    assert isinstance(study, SolidStudy)
+    coarse, finer = study.problem(), study.problem(SolidOptions(order=3, serendipity=True))
+    again = discretisation.HigherOrder(coarse, finer)
+    strokes = np.linspace(0.005, 0.05, 10)[:, None]
+    for state in advance(coarse, loaded_state(coarse, np.zeros(1)), strokes)[1:]:
+        found = again.solve(state.dofs, state.mu)
+        difference = finer.nodal_displacement(found.dofs) - coarse.nodal_displacement(state.dofs)
+        assert np.abs(difference).max() < 1e-9
+
+
+def test_a_finer_solution_on_another_branch_is_left_out(
+    solved: tuple[Study, Snapshots, md.ReducedModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """States said to have a negative eigenvalue, which the finer ones of this bar have not."""
+    load = discretisation.load_state
+    monkeypatch.setattr(discretisation, "load_state", lambda file: load(file) | {"pivots": np.array(1)})
+    entry = discretisation_errors(*solved, 0.0)
+    assert list(entry) == ["not_estimated"]
+    assert "another stability" in entry["not_estimated"]

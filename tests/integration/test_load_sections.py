@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import trimesh
 from morph_dslam import make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.inp_writing import save_mesh
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.solid_study import SolidStudy
 
@@ -57,6 +59,7 @@ PULLED, HELD = 1e4 * AREA, np.array([0.02, 0.02, HEIGHT / 2])
 #: A load, its resultant (N), a point on its line of action (m), and the tolerance.
 LOADS: dict[str, tuple[dict[str, Any], tuple[float, float, float], np.ndarray, float]] = {
     "traction": ({"on": "z_max", "traction": ["pull", "0 Pa", "-pull"]}, (PULLED, 0.0, -PULLED), MIDDLE, 1e-4),
+    "force": ({"on": ["z_max"], "force": ["6 N * share", "0 N", "-8 N"]}, (3.0, 0.0, -8.0), MIDDLE, 1e-6),
     "pressure": ({"on": "z_max", "pressure": "2 * pull"}, (0.0, 0.0, -2.0 * PULLED), MIDDLE, 1e-4),
     "body_force": (
         {"force": ["0 N/m3", "2000 N/m3 * share", "0 N/m3"]},
@@ -90,6 +93,40 @@ def test_supports_answer_a_load(kind: str) -> None:
     np.testing.assert_allclose(outputs["force_z_min"], -force, atol=tolerance * size)
     moment = np.cross(at, force)
     np.testing.assert_allclose(outputs["moment_z_min"], -moment, atol=tolerance * size * 0.04)
+
+
+def test_a_force_on_several_surfaces_is_shared_by_area() -> None:
+    """Of 8 N the top carries 4/6 and a side 2/6, each at its middle; a joint surface has the moment of both."""
+    load = {"kind": "force", "on": ["z_max", "x_max"], "force": ["0 N", "8 N", "0 N"]}
+    outputs = snapshot(loads=[load]).outputs
+    np.testing.assert_allclose(outputs["force_z_min"], [0.0, -8.0, 0.0], atol=1e-6)
+    at = (4.0 * MIDDLE + 2.0 * np.array([0.04, 0.02, HEIGHT / 2])) / 6.0
+    np.testing.assert_allclose(outputs["moment_z_min"], -np.cross(at, [0.0, 8.0, 0.0]), atol=1e-6)
+
+
+def test_a_force_bends_a_beam_as_timoshenko_says() -> None:
+    size, (young, length, side, force) = ["100 mm", "5 mm", "5 mm"], (1e9, 0.1, 0.005, 0.01)
+    tip = snapshot(
+        mesh={"generator": "block", "size": size, "divisions": [10, 1, 1]},
+        materials={"stiff": {"law": "linear_elastic", "young": "1 GPa", "poisson": 0.0}},
+        supports=[{"kind": "fixed", "on": "x_min"}],
+        loads=[{"kind": "force", "on": "x_max", "force": ["0 N", "0 N", "0.02 N * share"]}],
+    ).fields["displacement"][:, 2]
+    bending, shear = force * length**3 / (3.0 * young * side**4 / 12.0), force * length / (5 / 12 * young * side**2)
+    assert tip.max() == pytest.approx(bending + shear, rel=2e-3)
+
+
+def test_a_traction_on_a_node_set_acts_on_the_faces_that_it_holds(tmp_path: Path) -> None:
+    drawn = block((0.04, 0.04, HEIGHT), (2, 2, 1), "hex8")
+    sets = {"floor": drawn.set_nodes("z_min"), "lid": drawn.set_nodes("z_max"), "corner": np.array([0])}
+    save_mesh(tmp_path / "block.inp", replace(drawn, surfaces={}, node_sets=sets), "mm")
+    mesh = {"file": str(tmp_path / "block.inp"), "unit": "mm"}
+    pull = {"kind": "traction", "on": "lid", "traction": ["0 Pa", "0 Pa", "pull"]}
+    floor = [{"kind": "fixed", "on": "floor"}]
+    outputs = snapshot(mesh=mesh, supports=floor, loads=[pull]).outputs
+    np.testing.assert_allclose(outputs["force_floor"], [0.0, 0.0, -PULLED], atol=1e-6 * PULLED)
+    with pytest.raises(StudyError, match="load 1: on: 'corner' is a node set that holds no whole face"):
+        snapshot(mesh=mesh, supports=floor, loads=[pull | {"on": "corner"}])
 
 
 def test_a_block_sinks_into_its_foundation() -> None:
@@ -217,5 +254,5 @@ def test_surfaces_in_contact_are_sets_of_the_mesh() -> None:
     alone, with_itself = snapshot(materials=materials), snapshot(materials=materials, contacts=[touching])
     # A top that meets nothing is not changed.
     np.testing.assert_array_equal(alone.fields["displacement"], with_itself.fields["displacement"])
-    with pytest.raises(StudyError, match="no node set or surface 'lid'"):
+    with pytest.raises(StudyError, match="no surface 'lid'"):
         snapshot(materials=materials, contacts=[touching | {"against": "lid"}])

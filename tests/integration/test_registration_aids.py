@@ -198,12 +198,32 @@ def test_a_board_that_is_not_seen_or_of_other_sizes_is_refused(tmp_path, scene):
         (("gap_mm = 9", ""), "a grid needs gap_mm"),
         (("gap_mm = 9", "gap_mm = 9\nsquare_mm = 40"), "square_mm is for the other kind of board"),
         (("columns = 4", "columns = 0"), "columns: "),
+        (("marker_mm = 30", "marker_mm = 0.03"), "markers of 0.03 mm cannot be seen; sizes are in millimetres"),
         (("columns = 4", "columns = 50\nmargin = 3"), "unknown key margin; known here: kind, dictionary"),
     ],
 )
 def test_mistakes_in_a_board_file_are_named(tmp_path, change, message):
     with pytest.raises(RegistrationError, match=message):
         load_board(written(tmp_path, GRID.replace(*change)))
+
+
+@pytest.mark.parametrize("marker_mm", [19.0, 20.0, 22.2, 33.0, 45.5])
+@pytest.mark.parametrize("kind", ["grid", "charuco"])
+def test_markers_of_all_sizes_are_printed_where_they_belong(kind, marker_mm):
+    spacing, pitch_mm = ("gap_mm", marker_mm + 9.0) if kind == "grid" else ("square_mm", 1.41 * marker_mm)
+    sizes = {"marker_mm": marker_mm, spacing: 9.0 if kind == "grid" else pitch_mm}
+    board, density = FiducialBoard(BoardFile(kind=kind, dictionary="apriltag_36h11", columns=5, rows=7, **sizes)), 8000
+    image = cv2.copyMakeBorder(board.image(density), *[80] * 4, cv2.BORDER_CONSTANT, value=255)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    # Row by row, in a charuco board in the squares whose colour is not the first one's.
+    places = [(row, column) for row in range(7) for column in range(5) if kind == "grid" or (row + column) % 2]
+    assert sorted(ids.ravel().tolist()) == list(range(len(places)))
+    for found, number in zip(corners, ids.ravel(), strict=True):
+        row, column = places[number]
+        first = np.array([column, row]) * pitch_mm + (0.0 if kind == "grid" else 0.5 * (pitch_mm - marker_mm))
+        expected = 1e-3 * density * (first + marker_mm * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])) + 79.5
+        assert np.abs(found[0] - expected).max() < 1.5
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf"])
@@ -223,7 +243,7 @@ def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
 
 
 @pytest.mark.parametrize("printed", [lambda board: board, turned_tags], ids=["OpenCV's tags", "AprilTag's"])
-def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed):
+def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed, refused):
     board = printed(load_board(written(tmp_path, GRID)))
     world = SimilarityTransform(3.7, rotation_exp(np.array([0.4, -0.9, 1.3])), np.array([0.5, -1.2, 2.0]))
     rigid_map = RigidMap()
@@ -250,6 +270,12 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed)
     # The folder may be moved as a whole.
     content = json.loads((tmp_path / "place" / "registration.json").read_text())
     assert (content["map"], content["model"]) == ("../map.h5", "../sheet.morph")
+    # It is not replaced by accident.
+    (tmp_path / "place" / "registration.json").write_text("{}")
+    assert "place holds a registration already" in refused(*arguments, "-o", files[4])
+    assert (tmp_path / "place" / "registration.json").read_text() == "{}"
+    assert main([*arguments, "-o", files[4], "--overwrite"]) == 0
+    assert load_registration(tmp_path / "place" / "registration.json", scene.model).facts == placed.facts
 
 
 def print_on_sheet(scene):

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -82,6 +83,25 @@ def test_the_path_through_a_room_is_found_and_the_map_lies_on_its_walls(room_sce
     assert not any(term["is_wrong"] for term in summary["camera"].values())
     assert not summary["flags"]
     assert summary["n_keyframes"] == len(room_scene.keyframes) > 4
+
+
+def test_a_map_is_kept_if_the_check_of_its_camera_fails(room_scene, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("morph_dslam.slam.scene.estimate_camera", fail)
+    with pytest.raises(ZeroDivisionError):
+        replace(room_scene).save(tmp_path / "map.h5")
+    assert len(load_scene(tmp_path / "map.h5", CAMERA).points) == len(room_scene.points)
+
+
+def test_a_damaged_image_ends_a_run_that_says_what_it_kept(room_folder, tmp_path, refused):
+    shutil.copytree(room_folder / "film", tmp_path / "film")
+    damaged = sorted((tmp_path / "film").iterdir())[12]
+    damaged.write_bytes(damaged.read_bytes()[:-2000])
+    command = ["slam", tmp_path / "film", "--camera", room_folder / "camera.yaml", "--no-video", "-o", tmp_path / "run"]
+    assert f"the 12 frames before it are in {tmp_path / 'run'}" in refused(*command)
+    assert len((tmp_path / "run" / "frames.csv").read_text().splitlines()) == 13
 
 
 def test_the_same_film_gives_the_same_result_and_a_rigid_scene_does_not_freeze(room_scene, room_film):

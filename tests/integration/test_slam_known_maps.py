@@ -86,6 +86,25 @@ def test_the_camera_is_found_in_a_colmap_model(room, colmap):
     assert largest_error(room, track(room, read_colmap_model(colmap))) < 0.01
 
 
+def test_frames_that_have_the_numbers_of_the_maps_keyframes_are_not_taken_for_these(room, poses):
+    """Poses of a rolling shutter are found again from where the frames, not the keyframes, saw points."""
+    film, rolling = Film(room[1][20:]), replace(CAMERA, readout_s=1e-9)
+    assert largest_error(room, map_scene(film, rolling, known=poses, images=Film(room[1]))) < 0.005
+
+
+def test_the_camera_of_a_known_map_is_not_checked_and_one_that_is_elsewhere_is_told(room, poses):
+    scene = track(room, poses)
+    assert scene.camera_estimate() is None
+    assert scene.summary()["flags"] == []
+    known = replace(scene, slam=None)
+    known.map.camera_notes = ("of the map's recording",)
+    assert map_scene(Film(room[1][:3]), CAMERA, known=known).summary()["flags"] == ["of the map's recording"]
+    elsewhere = RoomFilm(seed=8)
+    film = Film([elsewhere.frame(place) for place in hand_held(3, seed=8)])
+    (flag,) = map_scene(film, CAMERA, known=known).summary()["flags"]
+    assert flag.startswith("the camera was found in no frame of this map: ")
+
+
 def test_what_does_not_fit_is_refused(room, poses, colmap):
     late = Trajectory(poses.timestamps + 100.0, poses.world_from_camera)
     with pytest.raises(MapError, match=r"only 0 of 40 frames of film .* 0\.000 to 1\.300 s.* 100\.000 to 101\.300"):

@@ -58,6 +58,8 @@ def test_path_and_map_are_metric_from_the_first_frame_on(kind, request):
     assert len(outside) > 400
     # At 4 m a fifth of a pixel of disparity is 8 cm.
     assert np.quantile(outside, 0.98) < 0.1
+    depths = np.concatenate([(scene.points - place[:3, 3]) @ place[:3, 2] for place in truth])
+    assert scene.summary()["median_depth_m"] == pytest.approx(np.median(depths), rel=0.15)
     assert (np.abs(outside) < 0.03).mean() > 0.4
 
 
@@ -152,6 +154,18 @@ def test_the_command_reads_recordings_with_depth_and_stereo_pairs(tmp_path, kind
     assert main([*command, str(tmp_path / "again"), "--map", str(run / "map.h5"), "--no-depth"]) == 0
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["n_tracked"] == 15
     assert load_scene(tmp_path / "again" / "map.h5", Slam(PAIR).camera if kind == "stereo" else CAMERA).is_metric
+
+
+def test_the_unit_of_depth_images_is_given(tmp_path, with_depth, capsys, refused):
+    camera = write_tum(tmp_path / "recording", with_depth.frames[:8])
+    command = ["slam", tmp_path / "recording", "--camera", camera, "--no-video", "--depth-per-metre"]
+    depths = []
+    for name, values in (("as_written", 5000), ("half", 10_000)):
+        assert main([str(word) for word in [*command, values, "-o", tmp_path / name]]) == 0
+        depths.append(float(capsys.readouterr().out.split("median_depth_m=")[1]))
+    assert depths[0] == pytest.approx(2.0 * depths[1], rel=0.03)
+    (tmp_path / "recording" / "depth.txt").unlink()
+    assert "leave --depth-per-metre out" in refused(*command, 1000, "-o", tmp_path / "none")
 
 
 def test_depth_that_is_left_aside_leaves_one_camera(with_depth):

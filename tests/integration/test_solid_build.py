@@ -251,6 +251,30 @@ def test_a_solid_is_tracked_by_its_outline_alone_on_request(built, filmed):
     assert set(load_run(built / "plain").status) == {"tracked"}
 
 
+@pytest.mark.parametrize(("modes", "missed"), [(1, True), (8, False)])
+def test_stress_and_forces_that_are_reduced_badly_are_warned_of(modes, missed):
+    """A column bent to and fro by half its length is compressed either way: one mode has no such part."""
+    study = make_study(
+        {
+            "name": "column",
+            "mesh": {"generator": "block", "size": ["9 mm", "9 mm", "27 mm"], "divisions": [1, 1, 3], "cells": "hex8"},
+            "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
+            "supports": [
+                {"kind": "fixed", "on": "z_min"},
+                {"kind": "displacement", "on": "z_max", "x": "way", "y": "0 mm", "z": "0 mm"},
+            ],
+            "parameters": {"way": {"range": ["-15 mm", "15 mm"]}},
+            "sampling": {"scheme": "even", "training": 8, "held_out": 4, "refined": 0},
+            "reduction": {"max_modes": modes},
+            "solver": {"workers": 1},
+        }
+    )
+    certificate = build(study).certificate
+    assert (certificate["reaction_force_z_max"]["relative_l2"] > 0.5) is missed
+    warnings = [text for text in certificate.get("warnings", []) if "% of von Mises stress and" in text]
+    assert len(warnings) == missed
+
+
 def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_path):
     """E = 3 MPa, nu = 0.45, stretch 1.5: lateral stretch 0.830679, nominal stress 1.075843 MPa."""
     text = BLOCK[: BLOCK.index("[[supports]]")] + sliding(("x_min", "x"), ("y_min", "y"), ("z_min", "z"))

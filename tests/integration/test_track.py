@@ -13,6 +13,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.folders import only_writer
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
@@ -75,7 +76,7 @@ def test_result_file_has_the_documented_layout(finished):
         }
         shapes = {name: item.shape for name, item in file.items()}
         assert file["timings_ms"].attrs["names"].tolist() == [*STAGES, "total"]
-        assert file["reason"].asstr()[BLANK].startswith("lost: ")
+        assert "points agree" in file["reason"].asstr()[BLANK]
         assert np.isnan(file["parameters"][BLANK]).all()
         assert file["parameter_std"][1].max() < 0.01
         assert (file["n_inliers"][:BLANK] > 250).all()
@@ -198,6 +199,15 @@ def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs,
     assert summary["flags"][-1].startswith("1 of 1 frames were lost")
     assert not load_run(tmp_path / "run").tracked.any()
     assert (tmp_path / "run" / "augmented.mp4").is_file()
+
+
+def test_two_runs_do_not_write_to_one_folder(inputs, tmp_path):
+    chosen = options(inputs, tmp_path / "run", last=20, video=False, overwrite=True)
+    with only_writer(tmp_path / "run"), pytest.raises(TrackingError, match="another run is writing"):
+        track(chosen)
+    assert list((tmp_path / "run").iterdir()) == []
+    assert track(chosen)["n_frames"] == 1
+    assert track(chosen)["n_frames"] == 1
 
 
 def test_random_walk_and_start_are_named(inputs, tmp_path):

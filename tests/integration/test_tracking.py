@@ -5,17 +5,19 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import ArgumentError, CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.outcomes import RejectionReason
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import DepthNotUsed, RejectionReason
 from morph_dslam.tracking.result import STAGES
+from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_state
+from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_depth, sheet_state
 from tests.support.staged_scenes import aside
 
 
@@ -27,6 +29,12 @@ def model():
 @pytest.fixture(scope="module")
 def film(model):
     return SheetFilm(model)
+
+
+def started_alike(model, options=None):
+    """A tracker whose reference frame has the same noise each time."""
+    first = sheet_state(0.0)
+    return Tracker(model, CAMERA, Registration(model, first), options, reference=SheetFilm(model).frame(first))
 
 
 def start(model, film, **options):
@@ -114,6 +122,73 @@ def test_sequence_that_does_not_begin_at_the_reference_is_entered(model, film):
 def test_object_without_texture_is_refused_with_advice(model, film):
     with pytest.raises(RegistrationError, match="printed texture"):
         Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), reference=film.blank(noise=0.0))
+
+
+def test_a_grey_picture_is_as_good_as_a_grey_one_in_colour(model):
+    picture, found = SheetFilm(model).frame(sheet_state(0.03)), []
+    for seen in (picture, picture[..., 0], picture[..., :1], Frame(1, 0.03, picture[..., 0])):
+        found.append(started_alike(model).track(seen).estimate.state.parameters)
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+def test_frames_that_are_none_are_refused(model):
+    tracker, picture = started_alike(model), SheetFilm(model).frame(sheet_state(0.03))
+    depth = np.full(picture.shape[:2], 0.6, np.float32)
+    for wrong in (None, picture.astype(float), picture[:100], Frame(3, 0.1, None), Frame(3, 0.1, picture[..., :2])):
+        with pytest.raises(CameraError, match="frame"):
+            tracker.track(wrong)
+    with pytest.raises(SourceError, match="frame 3 has no timestamp"):
+        tracker.track(Frame(3, None, picture))
+    with_depth = started_alike(model, TrackerOptions(use_depth=True))
+    for wrong in ((1e3 * depth).astype(np.uint16), depth[::2, ::2], depth[..., None], [0.6]):
+        with pytest.raises(CameraError, match=r"the depth of frame 3 is .*metres as float32"):
+            with_depth.track(Frame(3, 0.1, picture, wrong))
+    assert tracker.track(Frame(3, 0.1, picture, depth.astype(np.uint16))).tracked  # nobody asks for it
+    assert with_depth.track(Frame(3, 0.1, picture, depth)).tracked
+
+
+@pytest.mark.parametrize(("factor", "ratio"), [(1.0, None), (1e3, 1e3), (0.1, 0.1), (np.nan, None)])
+def test_depth_that_puts_the_object_elsewhere_does_not_count_and_that_is_said(model, factor, ratio):
+    truth = sheet_state(0.03)
+    depth = np.float32(factor) * sheet_depth(model, truth, np.random.default_rng(0))
+    frame = Frame(1, 0.03, SheetFilm(model).frame(truth), depth)
+    with_depth = started_alike(model, TrackerOptions(use_depth=True)).track(frame)
+    without = started_alike(model).track(frame)
+    warning = with_depth.warning(DepthNotUsed)
+    if factor == 1.0:
+        assert warning is None
+        assert with_depth.parameters != without.parameters
+    else:
+        assert warning.ratio == (ratio and pytest.approx(ratio, rel=0.01))
+        assert with_depth.parameters == without.parameters
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("notch.morph", CAMERA, None), "load_model"),
+        ((None, "camera.yaml", None), "model"),
+        (("model", "camera.yaml", "registration"), "load_camera"),
+        (("model", CAMERA, "landmarks.csv"), "register_landmarks"),
+        (("model", CAMERA, None), "register_landmarks"),
+        (("model", CAMERA, "registration", "fast"), "TrackerOptions"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(model, arguments, named):
+    known = {"model": model, "registration": Registration(model, sheet_state(0.0))}
+    with pytest.raises(ArgumentError, match=named):
+        Tracker(*(known.get(one, one) if isinstance(one, str) else one for one in arguments))
+
+
+def test_a_pose_is_held_fixed_by_a_map(model):
+    with pytest.raises(TrackingError, match="held fixed by a map"):
+        Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), TrackerOptions(pose="fixed"))
+
+
+def test_a_session_takes_trackers_by_name(model):
+    with pytest.raises(ArgumentError, match="by its name"):
+        Session(started_alike(model), [])
 
 
 def test_same_frames_give_the_same_states(model):

@@ -8,7 +8,7 @@ import pytest
 from morph_dslam.errors import StudyError
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.units import from_si, to_si
+from morph_dslam.units import from_si, read_quantity, to_si
 
 PARAMETERS = (
     Parameter("load", "pressure", "kPa", 0.0, 5e3, 0.0),
@@ -62,7 +62,9 @@ def test_expression_is_the_same_function_of_other_variables():
         (True, "ratio", r"True is not a number"),
         ("3 mm", "stress", r"'mm' is not a unit of stress"),
         ("weight", "stress", r"names 'weight', which is no parameter; the parameters are load, share, tilt"),
-        ("tilt", "stress", r"the parameter tilt is of angle, and stress is wanted"),
+        ("tilt", "stress", r'of angle, and stress is wanted here: write "10 Pa \* tilt / 1 deg" for example'),
+        ("2 * load", "ratio", r'of pressure, and ratio is wanted here: write "load / 1 kPa" for example'),
+        ("tilt / 100 mm2", "stress", r"'mm2' is not a unit of angle.* its own kind; write \"10 Pa \* tilt / 1 deg\""),
         ("3 kPa * load", "stress", r"only a parameter without unit can be multiplied by 3 kPa"),
         ("3 kPa * load", "stress", r'make it one with "load / 1 kPa"'),
         ("3 mm * load / 2 s", "length", r"'s' is not a unit of pressure"),
@@ -95,6 +97,20 @@ def test_mistakes(text, quantity, message):
 def test_units_follow_their_definitions_both_ways(value, unit, quantity, si):
     assert to_si(value, unit, quantity) == pytest.approx(si, rel=1e-15)
     assert from_si(si, unit, quantity) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "quantity", "si"),
+    [("20 mN", "force", 0.02), (" -1.5e1mm ", "length", -0.015), ("0.3", "ratio", 0.3), ("30 deg", "angle", pi / 6)],
+)
+def test_a_quantity_in_a_text(text, quantity, si):
+    assert read_quantity(text, quantity) == pytest.approx(si, rel=1e-15)
+
+
+@pytest.mark.parametrize("text", ["20", "mN", "20 mm", "2 0 mN", "nan mN", ""])
+def test_a_text_that_is_no_force_is_refused(text):
+    with pytest.raises(StudyError, match="force"):
+        read_quantity(text, "force")
 
 
 def test_a_unit_of_another_quantity_is_refused_with_those_that_fit():

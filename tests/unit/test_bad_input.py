@@ -10,18 +10,23 @@ import pytest
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError, ModelFileError, MorphError, RegistrationError, StudyError, TrackingError
+from morph_dslam.evaluation.pixels import load_tracks
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.folders import make_run_folder
+from morph_dslam.io.export import read_path
+from morph_dslam.io.folders import make_run_folder, only_writer
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.inp_writing import save_mesh
 from morph_dslam.model import load_model, save_model
+from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.registration.board import load_board
 from morph_dslam.registration.messages import WrongUnit
+from morph_dslam.studies.external import read_table
 from morph_dslam.studies.study import load_study
+from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import STUDY, write_study
 from tests.support.documents import PROJECT
 from tests.support.run_folders import write_run
@@ -158,6 +163,28 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
             make_run_folder(tmp_path / name, overwrite=True)
 
 
+def test_a_run_folder_has_one_writer(tmp_path):
+    run = tmp_path / "a" / "run"
+    with only_writer(run):
+        with pytest.raises(TrackingError, match="another run is writing"), only_writer(run):
+            pass
+        with only_writer(tmp_path / "b"):
+            pass
+    assert list(run.iterdir()) == []
+    # A process that is killed leaves no lock behind.
+    program = (
+        "import time; from pathlib import Path; from morph_dslam.io.folders import only_writer\n"
+        f"with only_writer(Path({str(run)!r})): print('holds it', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "holds it\n"
+        with pytest.raises(TrackingError, match="another run is writing"), only_writer(run):
+            pass
+        other.kill()
+    with only_writer(run):
+        pass
+
+
 def test_a_random_walk_whose_square_overflows(refused):
     arguments = ["track", "film", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "run"]
     said = refused(*arguments, "--random-walk", "arch=1e300")
@@ -213,7 +240,7 @@ def message_of_study(folder, *changes):
             "mesh: 'blok' is not a known generator (did you mean 'block'?); known are block, tube, revolution",
         ),
         (('name = "block"', "name = 5"), "name: 5 must be a text in quotes"),
-        (('on = "z_min"', 'on = ["left"]'), "support 1: on: ['left'] must be a text in quotes"),
+        (('on = "z_min"', "on = [3]"), "support 1: on: [3] must be a text in quotes"),
         (('on = "z_min"', 'on = "z_min"\nonn = 3'), "support 1: unknown key onn; known here: kind, on"),
         (('on = "z_min"\n', ""), "support 1: on is missing"),
         (("[[supports]]", "[supports]"), "supports must be a list, not a table: write [[supports]]"),
@@ -310,10 +337,20 @@ def test_what_a_model_is_made_from_is_no_model(folder):
         load_model(folder / "block.morph")
 
 
-def test_landmarks_separated_by_semicolons(tmp_path):
-    (tmp_path / "landmarks.csv").write_text("x_mm;y_mm;z_mm;u_px;v_px\n1,5;2;3;4;5\n")
-    with pytest.raises(RegistrationError, match=r"landmarks\.csv: .*semicolons: .* by commas, .* decimal points"):
-        load_landmarks(tmp_path / "landmarks.csv")
+@pytest.mark.parametrize(
+    ("read", "text"),
+    [
+        (load_landmarks, "x_mm;y_mm;z_mm;u_px;v_px\n1,5;2;3;4;5\n"),
+        (load_tracks, "frame;id;u;v\n1;a;2,5;3\n"),
+        (read_table, "file;force [N]\nrun0.vtu;0,5\n"),
+        (read_reference_curve, "modes;the paper\n1;0,9\n"),
+        (lambda path: read_path(bent_sheet_model(3, 3), path, np.zeros(3)), "arch_mm;time\n0,5;1\n"),
+    ],
+)
+def test_tables_separated_by_semicolons(tmp_path, read, text):
+    (tmp_path / "table.csv").write_text(text)
+    with pytest.raises(MorphError, match=r"table\.csv is separated by semicolons: .* commas .* points"):
+        read(tmp_path / "table.csv")
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (1 / 25.4, "inches"), (0.1, "centimetres")])

@@ -1,5 +1,6 @@
 """Cameras, lenses and stereo pairs against OpenCV, finite differences and closed forms."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -106,6 +107,52 @@ def test_wrong_lenses_are_refused():
         Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "mirror")
     with pytest.raises(CameraError, match="fisheye distortion has 0 values; give 4"):
         Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "fisheye")
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"width": 0}, "width is 0"),
+        ({"height": -480}, "height is -480"),
+        ({"fx": -5.0}, "fx is -5"),
+        ({"fy": float("nan")}, "fy is nan"),
+        ({"fx": float("inf")}, "fx is inf"),
+        ({"cx": float("nan")}, "finite"),
+        ({"distortion": (0.1, float("inf"), 0.0, 0.0)}, "finite"),
+    ],
+)
+def test_no_camera_has_such_intrinsics(change, named):
+    with pytest.raises(CameraError, match=named):
+        replace(PLAIN, **change)
+
+
+def test_one_point_has_one_pixel_and_points_have_three_coordinates():
+    np.testing.assert_allclose(PLAIN.project(np.array([0.1, -0.2, 2.0])), [318.5 + 26.4, 241.2 - 53.1])
+    for shape in ((4, 2), (2,), (2, 4, 3)):
+        with pytest.raises(CameraError, match=r"shape \(n, 3\)"):
+            PLAIN.project(np.ones(shape))
+
+
+def test_pictures_are_bytes_in_colour_or_grey():
+    picture = np.arange(480 * 640 * 3, dtype=np.uint8).reshape(480, 640, 3)
+    for channels in (picture, picture[..., 0], picture[..., :1]):
+        found = PLAIN.checked_picture(channels, "frame 7")
+        np.testing.assert_array_equal(found, channels.squeeze())
+    unfit = [picture.astype(kind) for kind in (np.uint16, np.int64, np.float32, bool)]
+    for wrong in (*unfit, np.zeros((480, 640, 4), np.uint8), picture[0, 0], picture[None], None, "frame.png"):
+        with pytest.raises(CameraError, match=r"^frame 7 is .*array of uint8, \(480, 640, 3\)"):
+            PLAIN.checked_picture(wrong, "frame 7")
+
+
+def test_the_camera_of_images_that_were_resized_is_told():
+    with pytest.raises(CameraError, match="fx: ") as caught:
+        PLAIN.check_image(np.zeros((240, 320, 3), np.uint8), "frame 7")
+    told = {name: float(value) for name, value in re.findall(r"(\w+): ([\d.]+)", str(caught.value).split("; of")[1])}
+    points = np.random.default_rng(0).uniform([-0.5, -0.5, 1.0], [0.5, 0.5, 2.0], (9, 3))
+    # The middle of the first pixel of the small image is that of the first four of the large one.
+    assert Camera(**told).project(points) == pytest.approx((PLAIN.project(points) - 0.5) / 2.0, abs=0.02)
+    with pytest.raises(CameraError, match=r"resize the images$"):
+        PLAIN.check_image(np.zeros((640, 480), np.uint8), "frame 7")
 
 
 def test_images_of_another_size_are_refused_by_name():

@@ -3,6 +3,8 @@
 Files are written as those programs write them; OpenCV's by OpenCV itself.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.camera_files import load_camera, load_camera_or_pair, save_camera
 from tests.support.real_data import real_data
 
@@ -143,6 +146,39 @@ def test_yaml_of_other_programs(tmp_path, text, expected):
     # What was read is kept by our own format.
     save_camera(tmp_path / "own.yaml", camera)
     assert load_camera(tmp_path / "own.yaml") == camera
+
+
+def test_the_first_message_of_a_topic_is_read(tmp_path):
+    path = tmp_path / "camera_info.yaml"
+    path.write_text(f"{ROS_TOPIC}---\n")
+    assert load_camera(path).fx == 300.0
+    path.write_text(f"{ROS_TOPIC}---\n{ROS_TOPIC.replace('300.0', '310.0')}---\n")
+    assert load_camera(path).fx == 300.0
+
+
+CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "doubt"),
+    [
+        ({"cx": 640.0, "cy": 480.0, "fx": 1056.0, "fy": 1056.0}, "principal point (640, 480) px is far"),
+        ({"width": 1280, "height": 960}, "principal point (320, 240) px is far"),
+        ({"fy": 352.0}, "fx and fy, 528 and 352 px"),
+        # x (1 - 28 x^2 + 7 x^4) is largest at x = 0.11: all is imaged within 38 px of the middle.
+        ({"distortion": (-28.0, 7.0, 0.0, 0.0)}, "folds the image"),
+        ({}, ""),
+        ({"cx": 230.0, "fx": 500.0}, ""),
+        ({"distortion": (-0.28, 0.07, 0.0, 0.0)}, ""),
+        # The first camera of TUM RGB-D, as published.
+        ({"distortion": (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)}, ""),
+        ({"distortion": (0.01, 0.0, 0.0, 0.0), "lens_model": "fisheye", "fx": 150.0, "fy": 150.0}, ""),
+    ],
+)
+def test_a_camera_that_is_hardly_right_is_doubted(change, doubt):
+    doubts = list(camera_doubts(replace(CAMERA, **change)))
+    assert len(doubts) == bool(doubt)
+    assert doubt in "".join(doubts)
 
 
 def test_a_camera_chosen_from_a_chain(tmp_path):

@@ -12,9 +12,12 @@ import pytest
 
 from morph_dslam.cli import app as cli
 from morph_dslam.cli.arguments import frame_range
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import StreamError, StudyError
 from morph_dslam.model import save_model
 from tests.support.bent_sheet import bent_sheet_model
+
+#: Figures of a run that are printed at its end.
+COUNTS = ("n_tracked", "n_frames", "n_hidden", "n_lost", "n_skipped", "median_ms", "p95_ms")
 
 
 @pytest.mark.parametrize("command", ["track", "live"])
@@ -93,6 +96,55 @@ def info_that_raises(monkeypatch, error):
 def test_errors_and_interrupts_become_statuses(monkeypatch, capsys, error, status, message):
     assert info_that_raises(monkeypatch, error) == status
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["track", "live"])
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (KeyboardInterrupt(), 130, "morph: interrupted; nothing was tracked yet"),
+        (StreamError("the port is taken"), 2, "morph: the port is taken"),
+    ],
+)
+def test_a_run_that_did_not_begin_leaves_no_empty_folder(
+    monkeypatch, tmp_path, capsys, command, error, status, message
+):
+    def ended(options, tell):
+        options.output.mkdir()
+        raise error
+
+    monkeypatch.setattr("morph_dslam.track", ended, raising=False)
+    words = ["film", "--camera", "c", "--landmarks", "l", "--model", "m", "-o", str(tmp_path / "run")]
+    assert cli.main([command, *words]) == status
+    assert capsys.readouterr().err.strip() == message
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupt_after_a_result_says_that_it_is_kept(monkeypatch, tmp_path, capsys):
+    def ended(options, tell):
+        options.output.mkdir()
+        (options.output / "summary.json").touch()
+        tell(
+            options.output, {"flags": [], "one_over_the_sequence": [], "largest_forces": []} | dict.fromkeys(COUNTS, 1)
+        )
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("morph_dslam.track", ended, raising=False)
+    words = ["film", "--camera", "c", "--landmarks", "l", "--model", "m", "-o", str(tmp_path / "run")]
+    assert cli.main(["track", *words]) == 130
+    assert "interrupted; the frames tracked so far are kept in the run folder" in capsys.readouterr().err
+    assert (tmp_path / "run" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("command", ["track", "live"])
+def test_help_shows_arguments_in_groups(command, capsys):
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    shown = capsys.readouterr().out
+    titles = ("objects and frames:", "where the object is:", "what is measured:", "what stands still:")
+    places = [shown.index(f"\n{title}") for title in (*titles, "forces and material:", "picture and output:")]
+    assert places == sorted(places)
+    assert ("--refine" in shown) == (command == "track")
 
 
 @pytest.mark.parametrize("defect", [ZeroDivisionError, BrokenPipeError])

@@ -12,13 +12,13 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.loads import DeadTraction
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
-from morph_dslam.mechanics.point_location import locate
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.newton import solve
 from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.mechanics.supports import fixed
 from morph_dslam.meshing.generators import block, tube
 from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.model.point_location import material_points
 from tests.support.meshes import cell_volumes
 from tests.support.solids import SOLID_CELLS, distorted
 
@@ -139,10 +139,8 @@ def test_normals_point_out_of_curved_cells() -> None:
 def test_points_are_found_in_curved_cells(cell_type: str) -> None:
     mesh = distorted(block((1.0, 1.0, 1.0), (3, 3, 3), cell_type), 0.03)
     points = np.random.default_rng(3).uniform(0.01, 0.99, (200, 3))
-    found = locate(mesh, points)
-    cells = mesh.blocks[0]
-    weights = cells.type.shape_functions(found.reference)
-    back = np.einsum("pk,pka->pa", weights, mesh.nodes[cells.connectivity[found.cells]])
+    found = material_points(mesh.nodes, {cell_type: mesh.blocks[0].connectivity}, points)
+    back = np.einsum("pk,pka->pa", found.weights, mesh.nodes[found.corners])
     np.testing.assert_allclose(back, points, atol=1e-10)
 
 

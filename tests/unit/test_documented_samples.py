@@ -49,7 +49,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("scene-file", "toml"): 2,
         ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
-        ("shell-study", "toml"): 1,
+        ("shell-study", "toml"): 2,
         ("solid-study", "csv"): 1,
         ("solid-study", "toml"): 7,
         ("study-file", "toml"): 1,
@@ -114,6 +114,17 @@ def test_study_of_a_shell():
     problem, mu = study.problem(), np.array([20.0, 0.2])
     start = loaded_state(problem, study.root())
     assert problem.nodal_displacement(advance(problem, start, mu)[-1].dofs)[:, 1].max() > 3e-4
+
+
+def test_hands_that_bend_a_sheet_come_together_as_an_arc_does():
+    plate = 'name = "sheet"\nmesh = { generator = "plate", size = ["400 mm", "150 mm"], divisions = [10, 4] }\n'
+    made = 'shell = { thickness = "1 mm" }\nmaterial = { young = "4 GPa", poisson = 0.3 }\n'
+    study = make_study(tomllib.loads(plate + made + samples("shell-study", "toml")[1]))
+    assert isinstance(study, ShellStudy)
+    way = read_affine(study.supports[1].translation[0], "length", study.model_parameters())
+    for degrees in (20.0, 35.0):
+        turn = np.radians(degrees)
+        assert way(np.array([turn, 0.0])) == pytest.approx(-0.4 * (1.0 - np.sin(turn) / turn), abs=7e-4)
 
 
 def test_a_recording_of_your_own(tmp_path, monkeypatch):
@@ -276,7 +287,7 @@ def test_a_simulated_sequence_is_tracked_in_memory(tmp_path, monkeypatch):
 
 
 def test_every_program_is_run_by_a_test():
-    """In `test_docs` (model-file, solid-study), `test_slam`, `test_stream_run`, and for the others tests/tutorials."""
+    """In `test_docs` (model-file, solid-study), `test_slam`, `test_own_program`, tests/tutorials, and others."""
     run_elsewhere = {"README", "quick-start", "extending"}
     pages = [page for page in PAGES if "tutorials" not in page and page not in run_elsewhere]
     counts = {page: len(samples(page, "python")) for page in pages}
@@ -285,11 +296,13 @@ def test_every_program_is_run_by_a_test():
         "materials": 1,
         "meshes": 1,
         "model-file": 2,
+        "own-program": 8,
         "record-your-own": 1,
         "run-folder": 1,
         "scene-file": 1,
         "slam": 2,
         "solid-study": 2,
+        "sources": 1,
         "streams": 1,
     }
 

@@ -12,9 +12,10 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.edges import EdgeImages, Sighting
+from morph_dslam.registration.hints import GuessedPose, Hints
 from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.scene import View, camera_from_object
-from morph_dslam.registration.view_registration import EdgeSearch, GuessedPose, Hints
+from morph_dslam.registration.view_registration import EdgeSearch
 from morph_dslam.tracking.patches import normalize_contrast
 from tests.support.rendered_object import CAMERA, scanned, shaded, wedge
 

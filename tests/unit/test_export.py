@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from morph_dslam.cli import app as cli
-from morph_dslam.errors import ExportError
+from morph_dslam.errors import ExportError, ParameterError
 from morph_dslam.io.export import StateChoice, export
 from morph_dslam.io.gltf import FRAMES_PER_SECOND
 from morph_dslam.meshing.generators import block
@@ -290,14 +290,16 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
         ({"vary": ["bend=0:1:3"]}, "no parameter 'bend'; it has stretch, slide"),
         ({"vary": ["slide=0:11:3"]}, "--vary slide=0:11:3: 11 is outside the range of slide, -10 to 10 mm"),
         ({"vary": ["slide=0:1:3"], "at": ["slide=1"]}, "'slide' is both varied and fixed"),
-        ({"vary": ["slide=0:10"]}, "--vary slide=0:10 is not a parameter and its values, such as"),
+        ({"vary": ["slide=0:10"]}, "--vary slide=0:10 is not a parameter and its values, such as stretch=-0.2:0.2:21"),
         ({"vary": ["slide=0:nan:3"]}, "nan is outside the range"),
         ({"vary": ["slide=0:1:0"]}, "is not a parameter and its values"),
         ({"vary": ["slide=0:1:2", "slide=0:1:2"]}, "'slide' has a range already"),
         ({"vary": ["slide=0:1:1000000000"]}, "10000 is the most"),
         ({"vary": ["slide=0:1:101", "stretch=0:0.1:101"]}, "make 10201 states"),
-        ({"at": ["slide"]}, "--at slide is not a parameter and its value"),
-        ({"at": ["slide=x"]}, "--at slide=x: 'x' is not a value of slide"),
+        ({"at": ["slide"]}, "--at slide is not a parameter and its value, such as stretch=-0.2"),
+        ({"at": ["slide=x"]}, "--at slide=x: 'x' is not a value of slide: write a number in mm, or with another unit"),
+        ({"at": ["slide=2 cm"]}, "--at slide=2 cm: 20 is outside the range of slide, -10 to 10 mm"),
+        ({"at": ["slide=2mN"]}, "'mN' is not a unit of length"),
         ({"vary": ["slide=0:1:2"], "path": "p.csv"}, "give one of them"),
         ({"path": "absent.csv"}, r"cannot read the path .*absent\.csv"),
         ({"path": ("a,b\n1,2\n",)}, r"no column of a parameter; name the columns 'stretch \[1\]', 'slide"),
@@ -314,6 +316,46 @@ def test_states_that_cannot_be_are_refused(choice, message, tmp_path):
     choice = StateChoice(**{**choice, "path": tmp_path / path if path else None})
     with pytest.raises(ExportError, match=message):
         choice.states(stretched_block_model())
+
+
+@pytest.mark.parametrize(
+    ("states", "message"),
+    [
+        ([[0.0, 0.02]], "state 0: 20 is outside the range of slide, -10 to 10 mm"),
+        ([[0.0, 0.001], [np.nan, 0.0]], "state 1: nan is outside the range of stretch"),
+        ([[0.0, 0.0, 0.0]], r"for each of the parameters \(stretch, slide\), not the shape \(1, 3\)"),
+        (np.zeros((0, 2)), r"not the shape \(0, 2\)"),
+        ([["a", "b"]], "states are a StateChoice, or an array"),
+    ],
+)
+def test_arrays_of_states_that_cannot_be_are_refused_before_anything_is_written(states, message, tmp_path):
+    with pytest.raises(ExportError, match=message):
+        export(stretched_block_model(), tmp_path / "out", "vtu", states)
+    assert not (tmp_path / "out").exists()
+
+
+def test_formats_and_colours_that_do_not_exist_are_refused(tmp_path):
+    with pytest.raises(ExportError, match="'csv' is no format of an export; these are xdmf, vtu, gltf"):
+        export(stretched_block_model(), tmp_path / "out", "csv")  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match=r"holds no stres to show .* stress, strain, displacement"):
+        export(stretched_block_model(), tmp_path / "out", "gltf", show="stres")  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_value_may_have_a_unit_of_its_own():
+    states = StateChoice(vary=["slide=-1 cm:2mm:2"], at=["stretch=0.1"]).states(stretched_block_model())
+    np.testing.assert_allclose(states, [[0.1, -0.01], [0.1, 0.002]])
+
+
+def test_a_shorter_series_leaves_no_state_of_the_one_before(tmp_path):
+    """What others wrote stays; a model in memory is called by its name."""
+    model = replace(stretched_block_model(), name="a/b c")
+    export(model, tmp_path, "vtu", np.zeros((3, 2)))
+    for name in ("a_b_c_0007.vtu", "a_b_c_d_0002.vtu"):
+        (tmp_path / name).write_text("of another program")
+    assert export(model, tmp_path, "vtu", [0.1, 0.0]) == tmp_path / "a_b_c.pvd"
+    expected = {"a_b_c.pvd", "a_b_c_0000.vtu", "a_b_c_0007.vtu", "a_b_c_d_0002.vtu", "states.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == expected
 
 
 def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, refused):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.errors import ParameterError, StudyError
-from morph_dslam.mechanics.point_location import material_points
+from morph_dslam.errors import ParameterError
 from morph_dslam.model import SeparatedField, SurfacePoints
 from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, fourier_basis
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
@@ -249,7 +248,7 @@ def test_points_inside_of_cells_follow_the_interpolated_field():
     model = block_model("tucker")
     rng = np.random.default_rng(7)
     positions = rng.uniform(0.0, 0.1, (30, 3))
-    points = material_points(model, positions)
+    points = model.points(positions)
     np.testing.assert_allclose(model.rest_positions(points), positions, atol=1e-12)
     known = lambda p: np.stack([p.prod(axis=1), 1.0 + p[:, 0], p[:, 1]], axis=-1)  # noqa: E731
     values = rng.normal(size=(6, 1, 1))
@@ -260,17 +259,17 @@ def test_points_inside_of_cells_follow_the_interpolated_field():
     whole = model.stresses["solid"].value(MU)
     stress = model.restrict(points, "stress_solid").value(MU)
     np.testing.assert_allclose(stress, np.einsum("pc,pcx->px", points.weights, whole[points.corners]))
-    with pytest.raises(StudyError, match=r"1 of 2 points lie outside of the solid, the first at \(120, 0, 0\)"):
-        material_points(model, np.array([[0.05, 0.05, 0.05], [0.12, 0.0, 0.0]]))
+    with pytest.raises(ParameterError, match=r"1 of 2 points lie outside of the object, the first at \(120, 0, 0\)"):
+        model.points(np.array([[0.05, 0.05, 0.05], [0.12, 0.0, 0.0]]))
 
 
 def test_points_just_outside_are_drawn_to_the_solid():
     model = block_model("tucker")  # a cube of 100 mm
     positions = np.array([[0.1004, 0.03, 0.05], [-0.0003, 0.1002, 0.07], [0.02, 0.03, 0.04]])
-    points = material_points(model, positions, reach=5e-4)
+    points = model.points(positions, reach=5e-4)
     np.testing.assert_allclose(model.rest_positions(points), np.clip(positions, 0.0, 0.1), atol=1e-12)
-    with pytest.raises(StudyError, match=r"1 of 3 points lie outside of the solid, the first at \(100.4, 30, 50\)"):
-        material_points(model, positions, reach=3.9e-4)
+    with pytest.raises(ParameterError, match=r"1 of 3 points lie outside .*, the first at \(100.4, 30, 50\)"):
+        model.points(positions, reach=3.9e-4)
 
 
 def test_interpolated_functions_are_those_of_one_parameter():

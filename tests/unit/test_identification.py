@@ -102,6 +102,42 @@ def test_forces_give_the_factor_of_the_moduli_and_the_zero_of_the_cell() -> None
     assert low < 0.8 < high < 0.85
 
 
+def test_an_interval_wider_than_numbers_reach_can_be_written() -> None:
+    """Forces that scatter by a thousand newtons tell nothing of a model of 100 N."""
+    model, places = plate(), np.linspace(0.0, 1.0, 25)
+    curve = ForceCurve("a", places, 1e3 * (-1.0) ** np.arange(25) * np.sin(np.pi * places) + places)
+    found = identify(model, [MeasuredForces(model, curve, reaction_in_direction(model, "edge:z"))], moduli=True)
+    assert json.dumps(summarise(found), allow_nan=False)
+    assert not found[FACTOR].identified
+
+
+def test_forces_outside_of_the_models_range_are_left_out() -> None:
+    """Within the range the factor is 0.8; the model has no solutions beyond, where the measured force falls."""
+    model, places = plate(), np.linspace(0.0, 1.5, 31)
+    measured = np.where(places <= 1.0, 80.0 * places, 80.0 - 300.0 * (places - 1.0))
+    reaction = reaction_in_direction(model, "edge:z")
+    found = identify(model, [MeasuredForces(model, ForceCurve("a", places, measured), reaction)], moduli=True)
+    assert found[FACTOR].value == pytest.approx(0.8, rel=1e-6)
+    said = "note: 10 of 31 forces of force are left out: they are outside of the model's range of a, 0 to 1"
+    assert said in identification_lines(summarise(found))
+    with pytest.raises(IdentificationError, match=r"0 forces of force are left .* range of a, 0 to 1"):
+        MeasuredForces(model, ForceCurve("a", 2.0 + places, measured), reaction)
+
+
+def test_what_a_result_rests_on_is_said() -> None:
+    """Which defaults were assumed, and the part of the model's error that intervals lack."""
+    error = {"errors": {"reaction_force_edge": {"relative_l2": 0.03}}}
+    model, places = replace(plate(), certificate={"discretisation": error}), np.linspace(0.0, 1.0, 9)
+    forces = MeasuredForces(model, ForceCurve("a", places, 70.0 * places), reaction_in_direction(model, "edge:z"))
+    text = "\n".join(identification_lines(summarise(identify(model, [forces], moduli=True))))
+    assert f"defaults for force: b = 0.5, c = 0.5; {FACTOR} multiplies the moduli there" in text
+    assert "discretisation error: 3 % of the force on 'edge'" in text
+    table = points_at([0.3] * 4, 1e-3, {"b": np.full(16, 0.2)})
+    text = "\n".join(identification_lines(summarise(identify(table.model, [table], ["a"]))))
+    assert "defaults for points: c = 0.5" in text
+    assert "discretisation" not in text
+
+
 def test_forces_by_frame_name_the_loading_rate() -> None:
     """One parameter rises by 0.02 a frame, one frame is lost, the others stay."""
     model, frames = plate(), np.arange(10, 40)
@@ -162,7 +198,7 @@ def test_a_point_beside_the_surface_is_carried_as_a_rigid_body() -> None:
 
 def test_tables_are_read_with_units(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"
-    path.write_text("state,b_1,place_x_mm,place_y_cm,place_z_m,x_mm,y_mm,z_mm\none,0.25,10,2,0.03,11,,33\n")
+    path.write_text("state,b_1,place_x_mm,place_y [cm],place_z_m,x_mm,y_mm,z [mm]\none,0.25,10,2,0.03,11,,33\n")
     table = load_points(path, plate())
     assert table.places[0] == pytest.approx([0.01, 0.02, 0.03])
     assert table.values == pytest.approx([0.011, 0.033])
@@ -178,11 +214,16 @@ HEADER = "state,place_x_mm,place_y_mm,place_z_mm,x_mm,y_mm,z_mm\n"
         ("", "has no column state"),
         ("state,place_x_mm\none,1\n", "place_y_mm"),
         (HEADER.replace("x_mm,y", "x_N,y", 1) + "one,0,0,0,1,1,1\n", "unit of length"),
-        (HEADER + "one,0,0,zero,1,1,1\n", "'zero' is not a number"),
+        (HEADER + "one,0,0,zero,1,1,1\n", "line 2, column 'place_z_mm': 'zero' is not a number"),
+        (HEADER.replace(",", ";") + "one;0;0;0;1;1;1\n", "is separated by semicolons"),
+        ("one,0,0,0,1,1,1\n", "has no column state, place_x_mm"),
+        (HEADER + "one,0,0,0,1,1,1\none,0,0,0\n", "line 3: 4 cells under 7 titles"),
+        ("b_1," + HEADER + "0.5,one,0,0,0,1,1,1\n5,two,0,0,0,1,1,1\n", "line 3, column 'b_1': 5 is .* range, 0 to 1"),
+        ("b_1," + HEADER + "0.5,one,0,0,0,1,1,1\n0.6,one,1,0,0,1,1,1\n", "0.6 here and 0.5 in line 2"),
         (HEADER + "one,0,,0,1,1,1\n", "every row needs"),
         (HEADER + "one,0,0,0,,,\n", "no point was measured"),
         ("load_N," + HEADER + "1,one,0,0,0,1,1,1\n", "'load_N' is no parameter"),
-        ("b_1," + HEADER + ",one,0,0,0,1,1,1\n", "parameter 'b' is not given"),
+        ("b_1," + HEADER + ",one,0,0,0,1,1,1\n", "column 'b_1' is empty"),
     ],
 )
 def test_wrong_tables_are_refused(tmp_path: Path, content: str, said: str) -> None:

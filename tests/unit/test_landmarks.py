@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
@@ -73,6 +73,39 @@ def test_landmarks_that_cannot_be_right_are_named():
         register_landmarks(MODEL, CAMERA, Landmarks(landmarks().points, pixels))
     with pytest.raises(RegistrationError, match="3 landmarks"):
         register_landmarks(MODEL, CAMERA, Landmarks(points[:3], pixels[:3]))
+
+
+def test_landmarks_may_be_lists():
+    exact = landmarks()
+    found = register_landmarks(MODEL, CAMERA, Landmarks(exact.points.tolist(), exact.pixels.tolist()), at_rest=False)
+    np.testing.assert_allclose(found.state.parameters, BENT.parameters, atol=1e-6)
+    for points, pixels in (([[0.0, 0.0]], [[1.0, 2.0]]), ([[0.0] * 3], [[1.0, 2.0]] * 2), ([["a"] * 3], [[1.0, 2.0]])):
+        with pytest.raises(RegistrationError, match="of landmarks"):
+            Landmarks(points, pixels)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("notch.morph", CAMERA, landmarks()), "load_model"),
+        ((MODEL, "camera.yaml", landmarks()), "load_camera"),
+        ((MODEL, CAMERA, []), r"Landmarks\(points, pixels\)"),
+        ((MODEL, CAMERA, landmarks().points), r"Landmarks\(points, pixels\)"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(arguments, named):
+    with pytest.raises(ArgumentError, match=named):
+        register_landmarks(*arguments)
+
+
+def test_a_registration_is_shown_in_one_line():
+    shown = repr(register_landmarks(MODEL, CAMERA, Landmarks(landmarks().points[:4], landmarks().pixels[:4])))
+    assert "by landmarks" in shown
+    assert "arch=" in shown
+    assert "1 warnings" in shown
+    assert len(shown) < 200
+    warning = Underdetermined(numbers=8, unknowns=9, enough=7)
+    assert str(warning) == warning.text
 
 
 def test_landmarks_in_the_wrong_order_do_not_fit():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import ArgumentError, SourceError
 from morph_dslam.sources import open_live, open_source, open_stream, register_source
 from morph_dslam.sources.frames import Frame
 from morph_dslam.sources.live import LiveCamera, Newest, PacedRecording
@@ -165,9 +165,15 @@ def test_the_newest_item_is_taken_and_an_error_comes_last():
         place.take()
 
 
-def test_webcams_that_cannot_be_opened():
+@pytest.mark.parametrize("name", ["webcam:97", "/dev/video97"])
+def test_webcams_that_cannot_be_opened(name):
     with pytest.raises(SourceError, match="webcam 97 cannot be opened"):
-        open_stream("webcam:97")
+        open_stream(name)
+
+
+def test_names_that_are_no_cameras_and_ranges_of_cameras():
+    with pytest.raises(ArgumentError, match="'webcam:0' for the first webcam"):
+        open_stream(0)
     for name in ("webcam", "webcam:x"):
         with pytest.raises(SourceError, match=f"at {name} .*webcam:0"):
             open_stream(name)
@@ -310,3 +316,72 @@ def test_sockets_that_cannot_be_used(sender):
     listening.close()
     with pytest.raises(SourceError, match=r"does not answer .*: the studio that made it has ended"):
         open_stream(path)
+
+
+class Served:
+    """A server on this computer that sends the same film to everyone who connects, and then falls silent."""
+
+    def __init__(self, parts):
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
+        self.connections = []
+        self.thread = threading.Thread(target=self.serve, args=(parts,), daemon=True)
+        self.thread.start()
+
+    def serve(self, parts):
+        while True:
+            try:
+                connection, _ = self.listener.accept()
+            except OSError:
+                return
+            self.connections.append(connection)
+            if parts:
+                connection.recv(4096)
+            for part in parts:
+                connection.sendall(part)
+
+    def close(self):
+        self.listener.shutdown(socket.SHUT_RDWR)
+        self.thread.join()
+        self.listener.close()
+        for connection in self.connections:
+            connection.close()
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr("morph_dslam.sources.frames.NETWORK_TIMEOUT_MS", 700)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_camera_on_the_network():
+    """Pictures as motion JPEG over HTTP, as network cameras send them; then silence."""
+    head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=next\r\n\r\n"
+    parts = [head]
+    for level in range(0, 240, 2):
+        jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), level, np.uint8))[1].tobytes()
+        parts.append(b"--next\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n" % (len(jpeg), jpeg))
+    server = Served(parts)
+    try:
+        with open_live(f"http://user:secret@{server.address}/video") as camera:
+            assert camera.name == f"http://{server.address}/video"
+            levels = []
+            with pytest.raises(SourceError, match=r"/video stopped delivering after frame \d+: check the network"):
+                levels.extend(int(frame.image[24, 32, 0]) for frame in camera)
+    finally:
+        server.close()
+    assert levels
+    assert levels == sorted(set(levels))
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("scheme", ["rtsp", "http"])
+def test_an_address_that_is_silent_or_dead_ends_in_one_message(scheme):
+    server = Served([])
+    try:
+        with pytest.raises(SourceError, match=f"no video comes from {scheme}://{server.address}/x: check the address"):
+            open_stream(f"{scheme}://{server.address}/x")
+    finally:
+        server.close()
+    with pytest.raises(SourceError, match="no video comes from"):
+        open_stream(f"{scheme}://{server.address}/x")

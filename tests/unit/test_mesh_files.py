@@ -1,6 +1,7 @@
 """Mesh files of every kind, written here or by other libraries, give metres, cells and named sets."""
 
 import re
+from dataclasses import replace
 from math import pi
 from pathlib import Path
 
@@ -9,8 +10,10 @@ import netgen.occ as occ
 import numpy as np
 import pytest
 
+from morph_dslam.cli import app as cli
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.inp_writing import save_mesh
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh
 from tests.support.meshes import cell_volumes, surface_area
@@ -209,6 +212,33 @@ def test_damaged_gmsh_files_are_refused(tmp_path, text, message):
     (tmp_path / "bar.msh").write_text(text)
     with pytest.raises(StudyError, match=f"bar.msh.*({message})"):
         load_mesh(tmp_path / "bar.msh", "mm")
+
+
+def test_an_ansys_file_which_meshio_writes_by_default_is_named(tmp_path):
+    drawn = block((2.0, 2.0, 3.0), (1, 2, 2), "hex8")
+    content = meshio.Mesh(drawn.nodes, [("hexahedron", drawn.blocks[0].connectivity)])
+    content.write(tmp_path / "block.msh")
+    with pytest.raises(StudyError, match=r'is an ANSYS mesh file.*file_format="gmsh"'):
+        load_mesh(tmp_path / "block.msh", "mm")
+    content.write(tmp_path / "block.msh", file_format="gmsh")
+    assert load_mesh(tmp_path / "block.msh", "mm").n_cells == 4
+
+
+def test_info_prints_the_sets_of_a_mesh(tmp_path, capsys):
+    drawn = block((0.02, 0.03, 0.06), (1, 1, 2), "hex8")
+    surfaces = {"face_10": drawn.surface("z_max"), "face_2": drawn.surface("x_min"), "skin": drawn.boundary_faces()}
+    mesh = replace(drawn, surfaces=surfaces, node_sets={"floor": drawn.set_nodes("z_min")})
+    save_mesh(tmp_path / "block.inp", replace(mesh, cell_sets={"part": np.array([0])}), "cm")
+    assert cli.main(["info", str(tmp_path / "block.inp"), "--unit", "cm"]) == 0
+    title, _, *rows = capsys.readouterr().out.splitlines()
+    assert title.endswith("20 x 30 x 60 mm, 2 hex8, 12 nodes")
+    assert [" ".join(row.split()) for row in rows] == [
+        "face_2 faces 2 1800 0 15 30 -1.00 0.00 0.00",
+        "face_10 faces 1 600 10 15 60 0.00 0.00 1.00",
+        "skin faces 10 7200 10 15 30 none",
+        "part cells 1",
+        "floor nodes 4 10 15 0",
+    ]
 
 
 def test_vtk_files_that_are_cut_short_are_refused(tmp_path):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.generators import SOLIDS, block, tube
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
 from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
+from morph_dslam.model.cell_types import cell_type
 from tests.support.meshes import SHEET, cell_volumes
 
 

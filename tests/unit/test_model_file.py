@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.errors import ModelFileError
+from morph_dslam.errors import ArgumentError, ModelFileError
 from morph_dslam.io.checksum import write_checksum
 from morph_dslam.model import SeparatedField, load_model, save_model
 from tests.support.bent_sheet import bent_sheet_model
@@ -336,3 +336,11 @@ def test_the_command_line_says_in_one_message_that_a_file_is_damaged(tmp_path, c
     assert cli.main(["info", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert str(path) in line
+
+
+def test_arguments_of_another_kind_are_refused(tmp_path):
+    model = bent_sheet_model(3, 3)
+    with pytest.raises(ArgumentError, match=r"first argument of save_model .* and the model as the second"):
+        save_model(model, tmp_path / "sheet.morph")  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="the model file is None: give its path"):
+        load_model(None)  # type: ignore[arg-type]

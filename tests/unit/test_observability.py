@@ -21,6 +21,7 @@ from morph_dslam.tracking.observability import (
 from morph_dslam.tracking.outcomes import FoundBy, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_folder import summarise
+from morph_dslam.tracking.run_notices import RunNotice, RunWarning, flags_of
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model, sheet_mesh
@@ -87,6 +88,27 @@ def test_parameters_without_effect_and_those_that_act_alike_are_named():
     assert (both["kind"], both["parameters"], both["count"]) == ("unobservable", ["load", "stiffness"], 3)
     # 2 stiffness - load stays the same: twice as much of the load as of the stiffness, both in shares of 2.
     assert "'load' is 0.179 larger and 'stiffness' is 0.0894 larger" in both["text"]
+
+
+def test_what_is_unobservable_is_said_in_two_lines_at_most():
+    def unobservable_in(count, *names):
+        data = {"parameters": list(names), "count": count, "statement": f"{names} in {count}"}
+        return RunNotice.of(RunWarning.UNOBSERVABLE, **data, over_the_sequence=False)
+
+    lost = RunNotice.of(RunWarning.LOST, count=1, n_frames=50)
+    combinations = [
+        unobservable_in(2, "left", "right"),
+        unobservable_in(5, "left", "way"),
+        unobservable_in(1, "a", "b"),
+    ]
+    said = flags_of([unobservable_in(35, "left"), *combinations, lost, unobservable_in(1, "right")])
+    assert said == [
+        lost.text,
+        "parameters are unobservable in some frames: 'left' in 35 frames, 'right' in 1 frame",
+        "('left', 'way') in 5; likewise 2 other combinations, in 3 frames",
+    ]
+    alone = [unobservable_in(4, "left"), unobservable_in(2, "left", "right")]
+    assert flags_of(alone) == [notice.text for notice in alone]
 
 
 def test_values_over_the_sequence_have_an_interval_and_say_when_nothing_tells():

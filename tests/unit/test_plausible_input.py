@@ -18,7 +18,11 @@ from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.netgen_meshing import MOST_CELLS
 from morph_dslam.slam.map_files import save_map
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.result import SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import GOOD, Followed, Keyframe, RigidMap
+from morph_dslam.slam.run_notes import run_notes, time_notes
+from morph_dslam.slam.slam import Slam
 from tests.support.meshes import cell_volumes
 
 CAMERA = md.Camera(640, 480, 528.0, 530.0, 319.5, 239.5)
@@ -117,6 +121,36 @@ def test_a_map_made_with_another_lens_says_by_how_much(tmp_path):
         assert md.load_scene(path, replace(CAMERA, distortion=lens)).camera_notes == ()
 
 
+@pytest.mark.parametrize(
+    ("timestamps", "readout_s", "words"),
+    [
+        (np.arange(9) / 30.0, 0.033, ()),
+        (
+            [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0],
+            0.0,
+            ("frames 1, 3, 4, 5, 6 and 1 more have the timestamp of the frame before",),
+        ),
+        ([0.0, 0.1, 0.3, 0.2, 0.4], 0.0, ("the timestamps go back at frames 3",)),
+        (np.arange(9) * 33_333_333.0, 0.02, ("3.33e+07 s apart", "nanoseconds")),
+        (np.arange(9) / 30.0, 0.33, ("readout_s", "0.33 s", "0.0333 s")),
+        ([5.0], 0.02, ()),
+    ],
+)
+def test_times_of_frames_that_cannot_be_right_are_told(timestamps, readout_s, words):
+    frames = [SlamFrame(k, float(time), SlamStatus.TRACKED) for k, time in enumerate(timestamps)]
+    notes = list(time_notes(frames, readout_s))
+    assert len(notes) == bool(words)
+    assert all(word in notes[0] for word in words)
+
+
+def test_depth_images_that_do_not_belong_to_the_pixels_are_told():
+    image, depth = np.zeros((CAMERA.height, CAMERA.width), np.uint8), np.ones((CAMERA.height, CAMERA.width), np.float32)
+    for slam, n_told in ((Slam(CAMERA), 2), (Slam(CAMERA, with_depth=True), 0), (Slam(CAMERA, SlamOptions(False)), 0)):
+        frames = [slam.process_frame(image, k, k / 30.0, depth) for k in range(2)]
+        told = [note for note in run_notes(slam, frames, frames) if "not registered" in note]
+        assert [note[:2] for note in told] == ["2 "] * bool(n_told)
+
+
 def test_a_folder_and_a_point_cloud_are_no_maps_but_the_message_says_what_is(tmp_path, capsys):
     run = tmp_path / "scan"
     run.mkdir()
@@ -157,9 +191,8 @@ def test_a_path_without_scale_has_no_error_without_alignment_of_scale(tmp_path, 
         figures = dict(part.split("=") for part in line.split())
         assert float(figures["ate_se3_mm"]) == pytest.approx(left if without_scale else np.nan, abs=0.01, nan_ok=True)
         assert (float(figures["ate_sim3_mm"]), float(figures["scale"])) == pytest.approx((0.0, 2.0), abs=1e-3)
-        assert [note.startswith("note: the scale of the run's map is unknown") for note in notes] == (
-            [] if without_scale else [True]
-        )
+        expected = "the true path is 2 times" if without_scale else "the scale of the run's map is unknown"
+        assert [note.startswith(f"note: {expected}") for note in notes] == [True]
     assert (md.evaluate_trajectory(run, truth)["se3"] is None) != is_metric
 
 

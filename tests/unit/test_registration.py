@@ -52,6 +52,24 @@ def in_map(model, centre=(0.0, 0.0, 0.0), axis=None, warnings=()):
     return registration_in_map(model, placed, keyframes, facts, warnings, axis)
 
 
+def test_the_stated_deviations_are_those_of_the_middle_of_the_object():
+    model = bent_tube()
+    centre = model.nodes.mean(axis=0)
+    pose = RigidTransform(rotation_exp(np.array([0.3, -0.4, 0.2])), np.array([0.05, -0.02, 0.6]))
+    distance = float(np.linalg.norm(pose.apply(centre)))
+
+    def stated(variances, own=None):
+        placed = MapRegistration(SimilarityTransform.identity(), centre, np.diag(variances))
+        return registration_in_map(model, placed, [KeyframePose(3, pose, own)], {}, ()).pose_deviations()
+
+    # One percent of size is one of distance; a turn about the middle leaves it where it is.
+    assert stated([1e-4, 0, 0, 0, 0, 0, 0]) == pytest.approx((0.01 * distance, 0.0), abs=1e-9)
+    assert stated([0, 4e-4, 1e-4, 1e-4, 0, 0, 0]) == pytest.approx((0.0, 0.02), abs=1e-9)
+    # A keyframe's own covariance is one of a turn about the object's origin and a shift of it.
+    own = np.diag([1e-4, 1e-4, 1e-4, 4e-6, 4e-6, 4e-6])
+    assert stated(np.zeros(7), own) == pytest.approx((np.sqrt(4e-6 + 1e-4 * centre @ centre), 0.01))
+
+
 def test_a_registration_in_a_map_is_read_as_it_was_saved(tmp_path):
     axis = Axis(np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.0]))
     saved = in_map(bent_tube(), (0.0, 0.0, 0.05), axis, [Ambiguous(Ambiguity.SECOND_PLACE, 0.9)])

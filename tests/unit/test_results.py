@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.cli.track import print_summary
+from morph_dslam.errors import MorphError, ParameterError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
@@ -51,6 +53,58 @@ def lost_result():
     )
 
 
+def test_what_a_lost_frame_or_a_model_has_not_is_named():
+    lost, tracked = lost_result(), frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False] * 3)
+    for ask in (lost.displacement, lost.positions, lost.von_mises, lost.von_mises_std, lost.strain, lost.reactions):
+        with pytest.raises(MorphError):
+            ask()
+    with pytest.raises(TrackingError, match="it is lost, 4 of 300 points agree"):
+        lost.displacement()
+    for ask in (tracked.von_mises, tracked.von_mises_std):
+        with pytest.raises(ParameterError, match="no stress 'solid'; it has top, bottom"):
+            ask("solid")
+        with pytest.raises(ParameterError, match="no stress; it has none"):
+            getattr(replace(tracked, model=replace(MODEL, stresses={})), ask.__name__)()
+    with pytest.raises(ParameterError, match="no strain"):
+        tracked.strain()
+
+
+def test_deviation_of_stress_is_that_of_the_face_with_more_stress():
+    top = MODEL.stresses["top"]
+    # Twice the stress on one half of the bottom, half of it on the other.
+    half = np.where(MODEL.nodes[:, 0] < 0.0, 2.0, 0.5)
+    model = replace(MODEL, stresses={"top": top, "bottom": top.with_modes(top.modes * half[:, None])})
+    result = replace(frame_result([0.03, 0.1, 0.1], [1e-3, 0.05, 0.01], [False] * 3), model=model)
+    larger = np.maximum(half, 1.0)
+    np.testing.assert_allclose(result.von_mises(), larger * result.von_mises("top"))
+    np.testing.assert_allclose(result.von_mises_std(), larger * result.von_mises_std("top"))
+
+
+def test_a_common_error_of_the_moduli_counts_in_forces_as_the_tracker_has_it():
+    functions = MODEL.displacement.functions
+    modes = np.zeros((len(MODEL.displacement.modes), 1, 3))
+    modes[0] = [3.0, 4.0, 0.0]
+    model = replace(MODEL, reactions={"force_end": SeparatedField(modes, functions)})
+    exact = frame_result([0.03, 0.1, 0.1], [0.0] * 3, [False] * 3)
+    result = replace(exact, model=model, modulus_std=0.1)
+    force = result.reactions()["end"].force
+    assert force.size > 0.0
+    assert force.size_std == pytest.approx(0.1 * force.size)
+    assert result.reactions(0.05)["end"].force.size_std == pytest.approx(0.05 * force.size)
+    assert result.reactions(0.0)["end"].force.size_std == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(TrackingError, match="modulus_std is 5: give a share"):
+        result.reactions(5)
+
+
+def test_results_are_shown_in_one_line_that_says_the_status_once():
+    lost, tracked = lost_result(), frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False] * 3)
+    assert lost.reason == "4 of 300 points agree, at least 30 needed"
+    assert repr(lost) == f"FrameResult(lost, '{lost.reason}')"
+    assert "arch=10±1 mm" in repr(tracked)
+    assert "280 of 300 points agree" in repr(tracked)
+    assert len(repr(tracked)) < 200
+
+
 def test_summary_counts_and_flags():
     run = RunResults(bent_sheet_model(22, 16), reference_frame=3)
     run.add(3, 0.0, frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False, False, False]))
@@ -71,6 +125,33 @@ def test_summary_counts_and_flags():
     turning = replace(run, revolution_angles=("arch",))
     assert notices_of(turning) == [lost, unobservable]
     assert not turning.at_bound().any()
+
+
+def test_fields_that_the_model_misses_are_named_and_forces_say_what_their_deviations_lack(tmp_path, capsys):
+    """A side that holds a hundredth of the force counts by that."""
+    modes = np.zeros((len(MODEL.displacement.modes), 1, 3))
+    modes[0] = [3.0, 4.0, 0.0]
+    force = SeparatedField(modes, MODEL.displacement.functions)
+    certificate = {
+        "stress_top": {"relative_l2": 0.3, "von_mises": {"relative_l2": 0.34, "largest_MPa": 80.0}},
+        "reaction_force_end": {"relative_l2": 0.04, "largest_N": 50.0},
+        "reaction_force_side": {"relative_l2": 3.9, "largest_N": 0.5},
+        "discretisation": {"errors": {"reaction_force_end": {"relative_l2": 0.02}}},
+    }
+    model = replace(MODEL, certificate=certificate, reactions={"force_end": force, "force_side": force})
+    run = RunResults(model, reference_frame=0)
+    run.add(0, 0.0, replace(frame_result([0.03, 0.1, 0.1], [1e-3, 0.05, 0.01], [False] * 3), model=model))
+    summary = summarise(run)
+    (flag,) = [notice for notice in summary["notices"] if notice["kind"] == "doubtful_fields"]
+    assert flag["relative"] == pytest.approx({"von Mises stress": 0.34})
+    assert "misses 34 % of von Mises stress at held-out solutions" in flag["text"]
+    print_summary(tmp_path, summary)
+    said = capsys.readouterr().out
+    assert "N in frame 0, not counting the model's own error, 6 %\n" in said
+    assert "N in frame 0, not counting the model's own reduction error, 390 %\n" in said
+    sides = {name: {**entry, "largest_N": 50.0} for name, entry in certificate.items() if name.endswith("_side")}
+    swapped = replace(run, model=replace(model, certificate=certificate | sides))
+    assert "34 % of von Mises stress and 390 % of forces" in notices_of(swapped)[0].text
 
 
 def test_a_bound_where_the_undeformed_object_rests_is_no_warning():

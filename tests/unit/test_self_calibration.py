@@ -211,6 +211,15 @@ def test_the_readout_time_of_a_rolling_shutter(readout_s):
     assert only.camera.readout_s == pytest.approx(readout_s, rel=0.06)
 
 
+def test_timestamps_that_are_rounded_tell_no_velocity_and_leave_the_rest_as_it_is():
+    rigid_map, given, path, seen = recording(CAMERA, CAMERA, n_points=80, n_frames=30)
+    rounded = Trajectory(np.round(path.timestamps), path.world_from_camera)
+    estimate = estimate_camera(rigid_map, given, rounded, seen)
+    assert estimate.terms["readout"].std == pytest.approx((0.03,), rel=1e-3)  # as before anything was measured
+    assert estimate.camera.fx == pytest.approx(525.0, rel=0.01)
+    assert not list(camera_notes(estimate))
+
+
 def test_poses_are_of_the_middle_rows():
     true = replace(CAMERA, readout_s=0.03)
     rigid_map, _, path, seen = recording(true, CAMERA, n_points=80, n_frames=30)

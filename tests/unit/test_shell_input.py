@@ -56,6 +56,7 @@ def test_a_study_of_a_surface_with_a_branch_ends_with_one_message(tmp_path, caps
         material = { young = "1 GPa", poisson = 0.3 }
         sets = { held = { box = [["0 mm", "0 mm", "0 mm"], ["0 mm", "10 mm", "0 mm"]] } }
         supports = [{ kind = "clamped", on = "held" }]
+        loads = [{ kind = "pressure", pressure = "load" }]
         parameters = { load = { range = ["0 Pa", "1 Pa"] } }
     """)
     command = ["build", tmp_path / "study.toml", "-o", tmp_path / "branch.morph"]
@@ -76,6 +77,8 @@ def test_a_study_of_a_surface_with_a_branch_ends_with_one_message(tmp_path, caps
         ({"sets": {"tip": {}}}, "either box or nearest"),
         ({"mesh": {"file": "sheet.vtu", "unit": "m", "size": "1 mm"}}, "size"),
         ({"shell": {"thickness": "1 mm * part"}}, "part"),
+        ({"shell": {"thickness": "1 mm * a"}}, "thickness = 0 m must be positive"),
+        ({"shell": {"thickness": "1 mm - 2 mm * a"}}, "thickness = -0.001 m must be positive where a = 1"),
     ],
 )
 def test_sections_that_say_what_cannot_be(change, message):

@@ -17,14 +17,13 @@ from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, MovingPa
 from morph_dslam.mechanics.materials.anisotropic import Orthotropic
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.parameters import ParameterSymbols
-from morph_dslam.mechanics.point_location import locate
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers.continuation import PathError
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter
-from morph_dslam.studies.build import build_warnings
+from morph_dslam.studies.build import build, build_warnings
 from morph_dslam.studies.provenance import locking_warnings
 from morph_dslam.studies.study import load_study, make_study
 from tests.support.block_study import write_study
@@ -104,6 +103,9 @@ def test_an_obstacle_that_overlaps_at_rest_is_refused() -> None:
     with pytest.raises(StudyError, match=r"the plane reaches 100 mm into the undeformed surface 'x_max'"):
         SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[above])
     SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[replace(above, point=(1.0, 0.0, 0.0))])
+    turned = replace(above, point=(1.1, 0.0, 0.0), normal=(1.0, 0.0, 0.0))
+    with pytest.raises(StudyError, match="all of the solid lies behind it, so turn its normal round"):
+        SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[turned])
     with pytest.raises(StudyError, match="the normal of the contact on 'x_max' has no direction"):
         replace(above, normal=(0.0, 0.0, 0.0))
     with pytest.raises(StudyError, match="no surface 'lid'"):
@@ -159,18 +161,13 @@ def test_parameters_shapes_and_directions_are_checked() -> None:
         MovingPatch("z_max", (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 0.0)
 
 
-def test_a_point_outside_is_named() -> None:
-    with pytest.raises(StudyError, match=r"1 of 2 points lie outside .*\(1500, 0, 0\) mm"):
-        locate(MESH, np.array([[0.5, 0.5, 0.5], [1.5, 0, 0]]))
-
-
 def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
     """A column pushed far past its buckling load: the last converged load is said and its state kept."""
     symbols = load_parameter(load=0.0)
     mesh = block((1.0, 0.1, 0.1), (6, 1, 1), "hex20")
     load = DeadTraction("x_max", (-1e6 * symbols["load"], 0.0, 1e3 * symbols["load"]))
     problem = SolidProblem(mesh, {"all": RUBBER}, [fixed("x_min")], [load], symbols)
-    with pytest.raises(PathError, match="last parameters that converged") as caught:
+    with pytest.raises(PathError, match=r" at load = .*parameters that converged are load = \d") as caught:
         solved(problem, 200.0)
     kept = caught.value.states[-1]
     assert 0.0 < kept.mu[0] < 200.0
@@ -197,6 +194,12 @@ def test_elements_that_lock_are_said_of_a_study(tmp_path, changes, expected):
     for line, part in zip(found, expected, strict=True):
         assert part in line
         assert line.endswith('leave out solver.formulation = "displacement"')
+
+
+def test_a_parameter_that_changes_nothing_is_refused_by_a_build(tmp_path):
+    study = write_study(tmp_path, ('"pull"]', '"300 kPa"]'))
+    with pytest.raises(StudyError, match=r"study\.toml: the parameter pull is used nowhere in the study"):
+        build(study, tmp_path / "block.morph")
 
 
 def test_build_warns_of_elements_method_and_stability():
@@ -237,3 +240,20 @@ def test_numbers_that_no_sheet_means_are_one_message(change, message):
     assert change[0] in text
     with pytest.raises(StudyError, match=re.escape(message)):
         make_study(tomllib.loads(text.replace(*change)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('"2 MPa", "4 MPa"', '"0 MPa", "4 MPa"'), "young = 0 must be positive"),
+        (
+            ('range = ["2 MPa", "4 MPa"]', 'range = ["-1 MPa", "4 MPa"]\ndefault = "3 MPa"'),
+            "young = -1e+06 must be positive where young = -1 MPa: change its range",
+        ),
+        (("poisson = 0.3", 'poisson = 0.3\ndensity = "-1 g/cm3"'), "density = -1000 must not be negative"),
+    ],
+)
+def test_constants_that_no_material_has_anywhere_in_the_box_are_refused(tmp_path, change, message):
+    with pytest.raises(StudyError, match=r"materials\.rubber: ") as caught:
+        load_study(write_study(tmp_path, change))
+    assert message in str(caught.value)

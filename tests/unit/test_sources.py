@@ -1,5 +1,7 @@
 """Frame sources: order, numbering, ranges, layouts of benchmarks, written videos, and registered kinds."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from morph_dslam.extend import register_source
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
 from morph_dslam.sources.frames import check_range
-from tests.support.real_data import real_data
+from tests.support.real_data import ROOT, real_data
 
 
 def grey(value, size=(32, 48)):
@@ -294,6 +296,29 @@ def test_seven_scenes_by_number(tmp_path):
     np.testing.assert_allclose(second.depth[0, :4], [1.5, np.nan, np.nan, 2.0])
     with pytest.raises(SourceError, match="frame 5 is not in"):
         open_source(tmp_path, 3, 5)
+
+
+def test_the_recipe_registers_depth_to_the_colour(tmp_path):
+    """A wall at 2 m and before its left half another at 1 m, in a depth camera to the right of the colour camera."""
+    stored = np.full((480, 640), 2000, np.uint16)
+    stored[:, :320], stored[:8] = 1000, 65535
+    for number in (0, 1):
+        cv2.imwrite(str(tmp_path / f"frame-{number:06d}.color.png"), np.zeros((480, 640, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "frame-000001.depth.png"), stored)
+    (recipe,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sources.md").read_text(), flags=re.DOTALL)
+    exec(recipe.replace('"seq-01"', repr(str(tmp_path))), {})
+    source = open_source(tmp_path)
+    assert source.has_registered_depth
+    first, second = source
+    assert (first.depth, second.timestamp) == (None, pytest.approx(1.0 / 30.0, abs=1e-6))
+    # The edge is in column 319.5: 1 m away, its point is 525 (-0.5 / 585 + 0.025) = 12.7 px right of the middle.
+    row = second.depth[240]
+    seen = np.isfinite(row)
+    assert np.nanmax(row[:320]) == 1.0
+    assert row[seen][np.flatnonzero(seen) > 334] == pytest.approx(2.0)
+    assert np.flatnonzero(row == 1.0).max() in (332, 333)
+    # 585 columns of the depth camera are 525 of the colour camera, so none is left out between them.
+    assert seen[60:320].all()
 
 
 def test_the_real_seven_scenes_recording():

@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.trajectory import absolute_error, associate, match, relative_error, statistics
+from morph_dslam.evaluation.trajectory import (
+    absolute_error,
+    associate,
+    evaluate_trajectory,
+    match,
+    relative_error,
+    statistics,
+)
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from tests.support.real_data import real_data
 
@@ -103,13 +110,39 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, capsys):
     save_trajectory(tmp_path / "truth.txt", helix())
     command = ["evaluate", str(run), "--trajectory", str(tmp_path / "truth.txt")]
     assert cli.main(command) == 0
-    line = capsys.readouterr().out
+    note, line = capsys.readouterr().out.splitlines()
+    assert "2 times as large as the estimated one" in note
     assert line.startswith("pairs=61/61 ate_se3_mm=")
     assert "ate_sim3_mm=0.00 scale=2.0000 rpe_mm=0.00 rpe_deg=0.000" in line
     figures = json.loads((run / "trajectory_evaluation.json").read_text())
     assert figures["truth_length_m"] == pytest.approx(4.0 * np.sqrt(1.04), rel=1e-3)
     assert figures["sim3"]["absolute_mm"]["max"] < 1e-3
     assert (run / "trajectory_evaluation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_mistakes_in_paths_are_named(tmp_path):
+    truth = helix(start=0.0, step=0.125)
+
+    def notes(estimate, truth=truth):
+        return evaluate_trajectory(moved(estimate), truth)["notes"]
+
+    noise = Rotation.from_rotvec(0.003 * np.random.default_rng(0).standard_normal((61, 3))).as_matrix()
+    good = Trajectory(truth.timestamps, truth.world_from_camera.copy())
+    good.world_from_camera[:, :3, :3] = noise @ good.world_from_camera[:, :3, :3]
+    assert notes(good) == []
+    (note,) = notes(good, Trajectory(truth.timestamps, np.linalg.inv(truth.world_from_camera)))
+    assert "inverted" in note
+    quaternions = Rotation.from_matrix(truth.world_from_camera[:, :3, :3]).as_quat(scalar_first=True)
+    rows = np.column_stack([truth.timestamps, truth.positions, quaternions])
+    np.savetxt(tmp_path / "truth.txt", rows, fmt="%.6f")
+    (note,) = notes(good, load_trajectory(tmp_path / "truth.txt"))
+    assert "truth begin with qw" in note
+    (note,) = notes(good, Trajectory(np.arange(61.0), truth.world_from_camera))
+    assert "of 61 poses" in note
+    assert "truth is stamped with whole numbers" in note
+    (note,) = evaluate_trajectory(moved(good, 5.0), truth)["notes"]
+    assert "5 times as large" in note
+    assert "depth images" in note
 
 
 def test_published_figures_of_freiburg1_xyz():

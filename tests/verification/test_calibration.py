@@ -1,11 +1,13 @@
 """Calibration against boards rendered with known cameras, and against OpenCV's published calibration."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.calibration.board import Board, View, find_corners, select_by_coverage
-from morph_dslam.calibration.calibrate import calibrate
+from morph_dslam.calibration.board import Board, View, Views, find_corners, select_by_coverage
+from morph_dslam.calibration.calibrate import Calibration, calibrate
 from morph_dslam.calibration.solve import solve_intrinsics
 from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
@@ -102,15 +104,16 @@ def test_exact_corners_give_the_exact_camera(camera, lens):
 def test_the_stated_deviation_is_that_of_repeated_calibrations(camera, lens):
     board = Board(8, 6, 0.025)  # of no orientation, so that the board's shape is not solved for
     exact = exact_views(camera, board_poses(camera, board, 12, 40.0, seed=5), board)
-    rng, focal, stated = np.random.default_rng(0), [], []
+    rng, found, stated = np.random.default_rng(0), [], []
     for _ in range(16):
         noisy = [View(v.name, v.corners + rng.normal(scale=0.1, size=v.corners.shape)) for v in exact]
         solution = solve_intrinsics(noisy, board, (640, 480), lens)
-        focal.append(solution.camera.fx)
-        stated.append(solution.focal_deviation[0])
+        found.append(solution.camera.intrinsics[[0, 2, 3]])
+        stated.append([solution.focal_deviation[0], *solution.centre_deviation])
+    focal = np.array(found)[:, 0]
     assert np.mean(focal) == pytest.approx(camera.fx, abs=3 * np.std(focal) / np.sqrt(16) + 0.05)
     # The standard deviation of 16 values is itself known to 18 per cent.
-    assert np.mean(stated) == pytest.approx(np.std(focal, ddof=1), rel=0.5)
+    assert np.mean(stated, axis=0) == pytest.approx(np.std(found, axis=0, ddof=1), rel=0.5)
 
 
 def test_a_bent_board_is_solved_for():
@@ -133,6 +136,20 @@ def test_views_that_fit_no_camera_are_left_out():
     solution = solve_intrinsics(views, BOARD, (640, 480))
     assert solution.left_out == ("moving",)
     assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
+
+
+@pytest.mark.parametrize(("shift", "is_told"), [(16.0, True), (0.0, False)])
+def test_pictures_of_two_cameras_are_told(shift, is_told):
+    poses, rng = board_poses(CAMERA, BOARD, 16, 40.0, seed=9), np.random.default_rng(0)
+    other = replace(CAMERA, cx=CAMERA.cx + shift)
+    views = [
+        View(f"{name}{k:02d}.jpg", view.corners + rng.normal(scale=0.1, size=view.corners.shape))
+        for name, camera, part in (("left", CAMERA, poses[:8]), ("right", other, poses[8:]))
+        for k, view in enumerate(exact_views(camera, part))
+    ]
+    solution = solve_intrinsics(views, BOARD, (640, 480))
+    remarks = list(Calibration(solution, Views(tuple(views), (640, 480), 16), BOARD).remarks())
+    assert any("'left...' and 'right...'" in remark for remark in remarks) == is_told
 
 
 def test_face_on_views_are_refused(tmp_path, refused):

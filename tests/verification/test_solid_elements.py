@@ -13,8 +13,8 @@ from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.newton import solve
 from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
-from morph_dslam.meshing.cell_types import cell_type as type_of
 from morph_dslam.meshing.generators import block
+from morph_dslam.model.cell_types import cell_type as type_of
 from tests.support.solids import (
     FACES,
     ROLLERS,

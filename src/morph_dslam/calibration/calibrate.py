@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from morph_dslam.calibration.board import Board, Views, collect_views
-from morph_dslam.calibration.solve import Solution, solve_intrinsics
+from morph_dslam.calibration.board import Board, View, Views, collect_views
+from morph_dslam.calibration.solve import FEWEST_VIEWS, Solution, solve_intrinsics
 from morph_dslam.camera import LensModel
 from morph_dslam.errors import CameraError
+from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.camera_files import save_camera
 
 DPI = 110
@@ -77,6 +79,27 @@ LEAST_COVERAGE = 0.5
 LARGE_RMS = 0.7
 #: A board bent by more than this part of its length is worth a remark.
 BENT = 0.005
+#: Principal points by parts of the views of one camera are this close, as a part of the width: real ones up to 0.01.
+MOST_APART = 0.02
+
+
+def _of_two_cameras(solution: Solution, board: Board) -> Iterator[str]:
+    """What to tell if views whose names begin differently, left01.jpg and right01.jpg say, give different cameras."""
+    groups: dict[str, list[View]] = {}
+    for view in solution.views:
+        groups.setdefault(re.split(r"\d", view.name)[0], []).append(view)
+    if len(groups) < 2 or min(map(len, groups.values())) < FEWEST_VIEWS:
+        return
+    size = (solution.camera.width, solution.camera.height)
+    try:
+        cameras = [solve_intrinsics(views, board, size, solution.camera.lens_model).camera for views in groups.values()]
+    except CameraError:
+        return  # a group alone does not determine its camera
+    centres = np.array([camera.intrinsics[2:] for camera in cameras])
+    apart = float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
+    if apart > MOST_APART * size[0]:
+        names = " and ".join(f"'{name}...'" for name in groups)
+        yield f"the views {names} give principal points up to {apart:.0f} px apart: calibrate each camera by itself"
 
 
 @dataclass(frozen=True)
@@ -110,6 +133,8 @@ class Calibration:
                 f"the residual of {solution.rms:.2f} pixels is large: are the images sharp and the board "
                 "flat, and is the lens a fisheye (--lens fisheye)?"
             )
+        yield from camera_doubts(solution.camera)
+        yield from _of_two_cameras(solution, self.board)
         length = self.board.square * max(self.board.columns, self.board.rows)
         if solution.flatness > BENT * length:
             yield f"the board is bent: its corners are up to {1e3 * solution.flatness:.1f} mm off its plane"
@@ -123,10 +148,14 @@ class Calibration:
 
     def line(self) -> str:
         """The one line that sums it up."""
-        camera, (deviation, _) = self.solution.camera, self.solution.focal_deviation
+        camera, (of_fx, _), (of_cx, of_cy) = (
+            self.solution.camera,
+            self.solution.focal_deviation,
+            self.solution.centre_deviation,
+        )
         return (
             f"fx={camera.fx:.2f} fy={camera.fy:.2f} cx={camera.cx:.2f} cy={camera.cy:.2f} "
-            f"sd_fx={deviation:.2f} rms_px={self.solution.rms:.3f} "
+            f"sd_fx={of_fx:.2f} sd_cx={of_cx:.2f} sd_cy={of_cy:.2f} rms_px={self.solution.rms:.3f} "
             f"views={len(self.solution.views)}/{self.found.n_searched} coverage={100 * self.coverage:.0f}%"
         )
 

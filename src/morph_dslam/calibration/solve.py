@@ -49,6 +49,7 @@ class Solution:
     camera_from_board : (v) poses
     residuals : (v, n, 2) found minus projected corners, pixels
     focal_deviation : standard deviation of fx and fy, pixels
+    centre_deviation : of cx and cy, pixels
     """
 
     camera: Camera
@@ -58,6 +59,7 @@ class Solution:
     camera_from_board: tuple[RigidTransform, ...]
     residuals: Array
     focal_deviation: tuple[float, float]
+    centre_deviation: tuple[float, float]
 
     @property
     def view_rms(self) -> Array:
@@ -145,8 +147,7 @@ def _solve_radial_tangential(
     _, matrix, coefficients, rotations, translations, points, deviations = found[:7]
     camera = _camera(size, matrix, coefficients, "radial-tangential")
     points = np.asarray(points, dtype=float).reshape(-1, 3) if with_shape else board.points
-    fx, fy = (float(value) for value in np.ravel(deviations)[:2])
-    return _solution(camera, views, points, rotations, translations, (fx, fy))
+    return _solution(camera, views, points, rotations, translations, np.ravel(deviations)[:4])
 
 
 def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -> Solution:
@@ -161,12 +162,12 @@ def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -
         start = np.array([[focal, 0.0, 0.5 * (size[0] - 1)], [0.0, focal, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]])
         try:
             found = cv2.fisheye.calibrate(objects, corners, size, start, np.zeros(4), flags=flags, criteria=_CRITERIA)
-        except cv2.error:
-            continue  # no pose of the board is seen through a lens of this angle
-        _, matrix, coefficients, rotations, translations = found
-        deviation = _fisheye_deviation(views, board, matrix, coefficients, rotations, translations)
-        camera = _camera(size, matrix, coefficients, "fisheye")
-        fits.append(_solution(camera, views, board.points, rotations, translations, deviation))
+            _, matrix, coefficients, rotations, translations = found
+            camera = _camera(size, matrix, coefficients, "fisheye")
+        except (cv2.error, CameraError):
+            continue  # no pose of the board is seen through a lens of this angle, or only a mirrored one
+        deviations = _fisheye_deviations(views, board, matrix, coefficients, rotations, translations)
+        fits.append(_solution(camera, views, board.points, rotations, translations, deviations))
         if fits[-1].rms < HARMLESS:
             break
     if not fits:
@@ -174,15 +175,15 @@ def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -
     return min(fits, key=lambda fit: fit.rms)
 
 
-def _fisheye_deviation(
+def _fisheye_deviations(
     views: Sequence[View],
     board: Board,
     matrix: NDArray,
     coefficients: NDArray,
     rotations: Sequence[NDArray],
     translations: Sequence[NDArray],
-) -> tuple[float, float]:
-    """Standard deviations of fx and fy, pixels, from the curvature of the sum of squares at its least."""
+) -> Array:
+    """Standard deviations (4,) of fx, fy, cx, cy, pixels, from the curvature of the sum of squares at its least."""
     n, squares = 2 * len(board.points), 0.0
     slopes = np.zeros((n * len(views), 8 + 6 * len(views)))
     for k, (view, rotation, translation) in enumerate(zip(views, rotations, translations, strict=True)):
@@ -196,8 +197,7 @@ def _fisheye_deviation(
     scale = np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
     covariance = np.linalg.pinv((slopes / scale).T @ (slopes / scale), hermitian=True)
     variance = squares / max(len(slopes) - slopes.shape[1], 1)
-    fx, fy = np.sqrt(np.maximum(np.diag(covariance)[:2], 0.0) * variance) / scale[:2]
-    return float(fx), float(fy)
+    return np.sqrt(np.maximum(np.diag(covariance)[:4], 0.0) * variance) / scale[:4]
 
 
 def _camera(size: tuple[int, int], matrix: NDArray, coefficients: NDArray, lens_model: LensModel) -> Camera:
@@ -211,12 +211,14 @@ def _solution(
     points: Array,
     rotations: Sequence[NDArray],
     translations: Sequence[NDArray],
-    focal_deviation: tuple[float, float],
+    deviations: NDArray,
 ) -> Solution:
+    """The solution of what OpenCV found; deviations (4,) of fx, fy, cx, cy."""
     poses = tuple(
         RigidTransform(rotation_exp(np.ravel(r).astype(float)), np.ravel(t).astype(float))
         for r, t in zip(rotations, translations, strict=True)
     )
     projected = [camera.project_recorded(pose.apply(points)) for pose in poses]
     residuals = np.array([view.corners for view in views]) - np.array(projected)
-    return Solution(camera, tuple(views), (), points, poses, residuals, focal_deviation)
+    fx, fy, cx, cy = deviations.tolist()
+    return Solution(camera, tuple(views), (), points, poses, residuals, (fx, fy), (cx, cy))

@@ -64,6 +64,7 @@ def run_and_report_errors(
 ) -> int:
     """Run an action and return the exit status.
 
+    ``kept`` says what an interrupt leaves, unless the interrupt itself brings other words. The status is
     0; 2 for a mistake the user can mend; 130 if interrupted; 141 if nobody reads what it prints any more.
     """
     try:
@@ -77,8 +78,8 @@ def run_and_report_errors(
     except MorphError as error:
         print(f"morph: {error}", file=sys.stderr)
         return USER_ERROR
-    except KeyboardInterrupt:
-        print(f"\nmorph: interrupted; {kept}", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"\nmorph: interrupted; {interrupt if interrupt.args else kept}", file=sys.stderr)
         return INTERRUPTED
     return 0
 

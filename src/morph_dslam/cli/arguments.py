@@ -39,29 +39,29 @@ def frame_range(text: str) -> tuple[int | None, int | None]:
 def add_file(
     command: argparse._ActionsContainer, name: str, text: str, metavar: str | None = None, required: bool = False
 ) -> None:
-    """Add a path."""
+    """Add a path, called as its name in the help where there is no ``metavar``."""
     more: dict[str, Any] = {"required": True} if required else {}
-    command.add_argument(name, type=Path, metavar=metavar, help=text, **more)
+    command.add_argument(name, type=Path, metavar=metavar or name.strip("-").upper(), help=text, **more)
 
 
-def add_output(command: argparse.ArgumentParser, metavar: str, text: str, required: bool = True) -> None:
+def add_output(command: argparse._ActionsContainer, metavar: str, text: str, required: bool = True) -> None:
     """Add ``-o``, the path to write to."""
     command.add_argument("-o", "--output", type=Path, required=required, metavar=metavar, help=text)
 
 
-def add_flag(command: argparse.ArgumentParser, name: str, text: str) -> None:
+def add_flag(command: argparse._ActionsContainer, name: str, text: str) -> None:
     """Add an option without a value."""
     command.add_argument(name, action="store_true", help=text)
 
 
 def add_repeated(
-    command: argparse.ArgumentParser, name: str, text: str, metavar: str, kind: Callable[[str], Any] = str
+    command: argparse._ActionsContainer, name: str, text: str, metavar: str, kind: Callable[[str], Any] = str
 ) -> None:
     """Add an option that may be given several times, whose values make a list."""
     command.add_argument(name, action="append", default=[], type=kind, metavar=metavar, help=f"{text}; may be repeated")
 
 
-def add_range(command: argparse.ArgumentParser, text: str) -> None:
+def add_range(command: argparse._ActionsContainer, text: str) -> None:
     """Add ``--range FIRST-LAST``, a `frame_range`."""
     command.add_argument("--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help=text)
 

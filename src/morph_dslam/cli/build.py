@@ -12,12 +12,15 @@ KEPT = "the solutions found so far are kept, and the same command goes on from t
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("study", type=Path, nargs="?", help="study file (docs/study-file.md)")
+    command.add_argument("study", type=Path, nargs="?", metavar="STUDY", help="study file (docs/study-file.md)")
     add_file(command, "--rigid", ".stl, .obj or .ply file of a rigid object, in place of a study", "SURFACE")
     command.add_argument("--unit", choices=("m", "cm", "mm"), help="unit of that file's coordinates")
     add_output(command, "MODEL", "model file to write")
     command.add_argument(
-        "--workers", type=positive_integer, metavar="N", help="processes to solve in (default: one a core)"
+        "--workers",
+        type=positive_integer,
+        metavar="N",
+        help="processes to solve in (default: the study's; without any one for solids, else one a core)",
     )
     add_file(
         command,

@@ -11,12 +11,16 @@ KEPT = "nothing was written"
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "source", type=Path, nargs="+", help="images, a folder of images, or a video (docs/cameras.md)"
+        "source",
+        type=Path,
+        nargs="+",
+        metavar="SOURCE",
+        help="images, a folder of images, or a video (docs/cameras.md)",
     )
     command.add_argument(
-        "--board", required=True, metavar="9x6", help="inner corners, where four squares meet, each way"
+        "--board", required=True, metavar="CORNERS", help="inner corners, where four squares meet, each way: 9x6"
     )
-    command.add_argument("--square", required=True, metavar="'25 mm'", help="side of one square, with its unit")
+    command.add_argument("--square", required=True, metavar="LENGTH", help="side of one square with its unit: '25 mm'")
     command.add_argument(
         "--lens",
         choices=("radial-tangential", "fisheye"),

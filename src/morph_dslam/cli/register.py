@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from morph_dslam.cli.arguments import add_file, add_output, add_repeated, positive_number, region
+from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_repeated, positive_number, region
 
 HELP = "find an undeformed object in the map of a scene, and the size of the map's unit"
 KEPT = "nothing was written"
@@ -35,6 +35,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "JSON",
         Path,
     )
+    add_flag(command, "--overwrite", "replace a registration that is in the folder")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -52,6 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
         distance=arguments.distance,
         region=arguments.region,
         guess=arguments.guess,
+        overwrite=arguments.overwrite,
     )
     assert registration.scene is not None
     for note in [*(warning.text for warning in registration.warnings), *registration.scene.camera_notes]:

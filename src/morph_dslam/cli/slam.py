@@ -2,7 +2,7 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, frame_number
+from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, frame_number, positive_number
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
 TERMS = ("focal", "centre", "radial", "tangential", "readout")
@@ -10,7 +10,7 @@ KEPT = "the frames seen so far, if any, and their map are kept in the run folder
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    add_file(command, "source", "recording (docs/sources.md), or webcam:0")
+    add_file(command, "source", "recording (docs/sources.md), or a camera: webcam:0, /dev/video0 or a URL")
     add_file(
         command,
         "--camera",
@@ -51,6 +51,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="estimate the focal length, the principal point, radial or tangential terms of the lens, the readout time "
         "of a rolling shutter, or all of them first, and write camera.yaml into the run folder; may be repeated",
     )
+    command.add_argument(
+        "--depth-per-metre",
+        type=positive_number,
+        metavar="V",
+        help="values a metre of the recording's depth images, 1000 for millimetres; 5000 by default",
+    )
     add_flag(command, "--no-depth", "leave the depth images of the recording aside")
     add_flag(command, "--overwrite", "replace a run that is in the run folder")
     add_flag(command, "--no-video", "do not draw the video with tracked points")
@@ -76,6 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
         trajectory=arguments.trajectory,
         images=arguments.images,
         refine=TERMS if "all" in arguments.refine_camera else tuple(dict.fromkeys(arguments.refine_camera)),
+        depth_per_metre=arguments.depth_per_metre,
         video=not arguments.no_video,
         overwrite=arguments.overwrite,
     )
@@ -87,7 +94,8 @@ def run(arguments: argparse.Namespace) -> None:
     for flag in summary["flags"]:
         print(f"note: {flag}")
     print(f"wrote {arguments.output}")
+    depth = "" if summary["median_depth_m"] is None else f" median_depth_m={summary['median_depth_m']:.3g}"
     print(
         f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_frames']} "
-        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}"
+        f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}{depth}"
     )

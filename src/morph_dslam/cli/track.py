@@ -1,24 +1,17 @@
-"""`morph track`, and what `morph live` shares with it: an object's pose and parameters in every frame."""
+"""`morph track`, and what `morph live` does as it does: an object's pose and parameters in every frame."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam.cli.arguments import (
-    add_file,
-    add_flag,
-    add_output,
-    add_range,
-    add_repeated,
-    frame_and_file,
-    named_value,
-    positive_number,
-)
+from morph_dslam.cli.arguments import add_file, add_flag, add_repeated
+from morph_dslam.cli.tracking_arguments import add_tracking_arguments
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
@@ -28,8 +21,6 @@ if TYPE_CHECKING:
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 #: Options that say where the object is.
 _STARTS = ("landmarks", "registration", "board", "picture", "guess")
-#: Kinds of streams, for the help.
-STREAMS = "ws:PORT by WebSocket, rerun:FILE.rrd or ros2:/PREFIX"
 KEPT = "the frames tracked so far are kept in the run folder"
 
 
@@ -41,15 +32,27 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "what is not named: model or study, camera, and where the object is",
         "FRAMES",
     )
-    add_tracking_arguments(command, required=False)
-    command.add_argument(
+    groups = add_tracking_arguments(command, required=False)
+    add_repeated(
+        groups.inputs,
+        "--with",
+        "what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too",
+        "FRAMES",
+        Path,
+    )
+    groups.start.add_argument(
         "--reference-frame",
         type=int,
         metavar="N",
         help="frame that the landmarks, or another start, belong to (default: the first one tracked); with "
         "--registration and --with: one in which the object is undeformed",
     )
-    command.add_argument(
+    add_flag(
+        groups.measured,
+        "--refine",
+        "refine the reference state over the whole sequence, with --discrepancy that too, and track once more",
+    )
+    groups.still.add_argument(
         "--refine-camera",
         action="append",
         default=[],
@@ -57,20 +60,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="with --still: estimate the focal length, or one radial term of the lens, over the recording too; may be "
         "repeated",
     )
-    add_flag(command, "--refine", "refine the reference state over the whole sequence and track once more")
-    add_repeated(
-        command,
-        "--with",
-        "what the next camera of the rig saw; with --camera camchain.yaml#cam0, which a map is of too",
-        "FRAMES",
-        Path,
-    )
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Track and print the figures of each run folder."""
-    from morph_dslam import track
-
     _complete(arguments)
     options = run_options(
         arguments,
@@ -80,7 +73,30 @@ def run(arguments: argparse.Namespace) -> None:
         refine_camera=tuple(dict.fromkeys(arguments.refine_camera)),
         other_cameras=tuple(vars(arguments)["with"]),  # a keyword of the language
     )
-    track(options, print_summary)
+    track_and_print(options)
+
+
+def track_and_print(options: TrackOptions) -> None:
+    """Track, and print the figures of each run folder; where nothing was tracked, no empty folder is left behind."""
+    from morph_dslam import track
+
+    absent = [folder for folder in options.folders if not folder.exists()]
+    written = []
+
+    def tell(folder: Path, summary: dict[str, Any]) -> None:
+        written.extend([folder] if summary else [])
+        print_summary(folder, summary)
+
+    try:
+        track(options, tell)
+    except KeyboardInterrupt:
+        if written:
+            raise
+        raise KeyboardInterrupt("nothing was tracked yet") from None
+    finally:
+        for folder in reversed(absent):
+            with suppress(OSError):  # it was not made, or holds something
+                folder.rmdir()
 
 
 def _complete(arguments: argparse.Namespace) -> None:
@@ -137,7 +153,8 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     for figures in summary["one_over_the_sequence"]:
         print(value_line(figures))
     for figures in summary["largest_forces"]:
-        print("largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures))
+        line = "largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures)
+        print(line + _model_error(figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
     if "live" in summary:
@@ -149,6 +166,14 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     # Of a live stream, frames that are skipped are those that were dropped.
     kinds = ("hidden", "lost") if "live" in summary else ("hidden", "lost", "skipped")
     print(line + "".join(f" {kind}={summary[f'n_{kind}']}" for kind in kinds if summary[f"n_{kind}"]))
+
+
+def _model_error(figures: dict[str, Any]) -> str:
+    """What a force's deviation does not contain, if the model states it."""
+    if "model_error" not in figures:
+        return ""
+    of = "error" if figures["model_error_of"] == "all" else "reduction error"
+    return f", not counting the model's own {of}, {100.0 * figures['model_error']:.3g} %"
 
 
 def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
@@ -230,132 +255,3 @@ def _random_walk(arguments: argparse.Namespace) -> tuple[tuple[str, float], ...]
 
     units = {parameter.name: parameter.display(1.0) for parameter in load_model(arguments.model).parameters}
     return tuple((name, step / units.get(name, 1.0)) for name, step in arguments.random_walk)
-
-
-def add_tracking_arguments(command: argparse.ArgumentParser, required: bool = True) -> None:
-    """The arguments that say what is tracked, with what, and where it is at first; whether these must be named."""
-    add_file(command, "--model", "model file of `morph build`", required=required)
-    add_file(command, "--camera", "camera file: size, intrinsics, distortion", required=required)
-    start = command.add_mutually_exclusive_group(required=required)
-    add_file(start, "--landmarks", "object points and their pixels in the reference frame")
-    add_flag(command, "--at-rest", "the object is undeformed in the frame of its landmarks")
-    add_flag(command, "--snap", "correct the landmarks by the object's outline in their frame")
-    add_file(start, "--registration", "registration.json of `morph register` in a map", "JSON")
-    add_file(start, "--board", "a printed board of markers, and where the object is on it", "TOML")
-    add_file(start, "--picture", "a picture of the object's print, and where it is on it", "TOML")
-    add_file(start, "--guess", "about where the object is in the reference frame", "TOML")
-    add_file(
-        command,
-        "--map",
-        "with --registration: the map that the camera is found in (default: the one that was registered in)",
-        "H5",
-    )
-    pose = command.add_mutually_exclusive_group()
-    pose.add_argument(
-        "--pose",
-        choices=("map", "fixed", "free"),
-        default="map",
-        help="the object's pose with --registration: by map and points together, by the map alone, or by its points "
-        "alone (default: %(default)s)",
-    )
-    pose.add_argument(
-        "--still",
-        dest="pose",
-        action="store_const",
-        const="still",
-        help="camera and support stand still: the pose is one over the sequence, estimated from all frames",
-    )
-    add_output(command, "RUN", "run folder to write", required)
-    add_flag(command, "--overwrite", "replace a run that is in the run folder")
-    add_flag(command, "--outline", "let the object's outline count too, where it stands out from the background")
-    add_flag(command, "--no-texture", "follow the object by its outline alone")
-    add_flag(
-        command,
-        "--discrepancy",
-        "look for what the object's shape has beyond the model's: small smooth displacements that "
-        "hardly stretch it; with --refine in the reference view too",
-    )
-    command.add_argument(
-        "--unknown-loads",
-        nargs="?",
-        type=float,
-        const=0.0,
-        metavar="JOULES",
-        help="estimate loads that the study does not foresee, by [unknown_loads] of its model: what presses or pulls "
-        "and how hard; likely ones do about this work (default: found from the sequence)",
-    )
-    add_flag(
-        command,
-        "--one-view",
-        "take one keyframe of the map as reference view, and make none when the object turns other parts to the camera",
-    )
-    add_flag(command, "--depth", "let the depth images of an RGB-D recording count too")
-    add_repeated(
-        command, "--inner", "a structure inside of the object (`morph inner`) to draw and report", "FILE", Path
-    )
-    add_repeated(command, "--per-sequence", "a parameter that is one over the whole sequence", "NAME")
-    add_repeated(
-        command,
-        "--random-walk",
-        "a prior on a parameter: the standard deviation of its change from frame to frame, in its own "
-        "unit (default: none)",
-        "NAME=STEP",
-        named_value,
-    )
-    command.add_argument(
-        "--start",
-        choices=("previous", "constant-velocity"),
-        default="previous",
-        help="where the search for a frame's state starts (default: %(default)s state)",
-    )
-    add_repeated(
-        command,
-        "--reregister-at",
-        "register the object, or that of --also NAME, anew in frame N, by landmarks there or by the board, "
-        "picture or guess that the run starts from",
-        "[NAME:]N[=FILE]",
-        frame_and_file,
-    )
-    command.add_argument(
-        "--also",
-        nargs=3,
-        action="append",
-        default=[],
-        metavar=("NAME", "MODEL", "START"),
-        help="another object in the same frames, its results in RUN/NAME; START is its registration.json in "
-        "the same map or its file of landmarks; may be repeated",
-    )
-    command.add_argument(
-        "--show",
-        choices=("stress", "strain", "displacement", "traction"),
-        help="what colours the object: von Mises stress (the default), equivalent strain, displacement, or the "
-        "traction of unknown loads",
-    )
-    command.add_argument(
-        "--section",
-        metavar="PLANE",
-        help="draw a solid cut open: x=12 takes away all beyond x = 12 mm, -x=12 all before it; also y and z",
-    )
-    add_flag(command, "--forces", "draw what supports exert on the object as arrows, with its size")
-    command.add_argument(
-        "--modulus-std",
-        type=positive_number,
-        default=0.0,
-        metavar="PERCENT",
-        help="standard deviation of the moduli of the study, by one common factor: it counts in the reactions of "
-        "supports (default: they are exact)",
-    )
-    add_range(command, "frames to track, of a recording")
-    add_flag(command, "--no-video", "do not draw the augmented video")
-    add_repeated(
-        command,
-        "--stream",
-        "send results to other programs as they come, " + STREAMS + " (docs/streams.md)",
-        "KIND[:WHERE]",
-    )
-    add_file(
-        command,
-        "--frame-log",
-        "write a line of JSON for each frame as soon as it is tracked (docs/run-folder.md)",
-        "FILE",
-    )

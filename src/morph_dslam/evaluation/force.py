@@ -6,7 +6,6 @@ one. A measured force gives that factor. It is fitted with an offset, the zero o
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.io.text import read_text
+from morph_dslam.io.text import read_csv
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE
 from morph_dslam.units import FACTORS
@@ -46,7 +45,7 @@ _OTHER_UNITS = {
     *("dyn", "kp", "kip", "kips", "tf", "ton", "tons", "lbs", "grams", "pounds"),
     *("nm", "nmm", "psi", "mv", "uv", "volt", "volts"),
 }
-_SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_BRACKETED = re.compile(r"(.*\S)\s*\[(.+)\]")
 _REACTION = re.compile(r"(?P<support>.+?)(?::(?P<sign>[+-]?)(?P<axis>[xyz]))?")
 
 
@@ -147,7 +146,8 @@ def _reaction(model: ReducedModel, support: str, axis: str, sign: str | None) ->
 
 
 def load_curve(path: str | Path, model: ReducedModel, column: str | None = None) -> ForceCurve:
-    """Read a curve: CSV whose first column is ``frame``, or a parameter with its unit, ``stroke_mm`` say.
+    """Read a curve: CSV whose first column is ``frame``, or a parameter with its unit, ``stroke_mm`` or
+    ``stroke [mm]`` say.
 
     The other columns are forces with their unit, ``force_N`` say, in newtons where they name none.
 
@@ -180,20 +180,8 @@ def load_curve(path: str | Path, model: ReducedModel, column: str | None = None)
 
 def _table(path: str | Path) -> list[tuple[int, list[str]]]:
     """Line numbers and cells of the lines that hold any, without empty cells at their ends; the titles are first."""
-    reader = csv.reader(read_text(Path(path), "force curve", EvaluationError).splitlines())
-    rows = [(reader.line_num, _filled(row)) for row in reader if any(cell.strip() for cell in row)] or [(1, [""])]
-    for separator, name in _SEPARATORS.items():
-        if separator in rows[0][1][0]:
-            raise EvaluationError(
-                f"{path} is separated by {name}: write commas between cells, and decimals with points"
-            )
-    return rows
-
-
-def _filled(row: Sequence[str]) -> list[str]:
-    """Its cells up to the last that is not empty."""
-    cells = [cell.strip() for cell in row]
-    return cells[: max(i for i, cell in enumerate(cells) if cell) + 1]
+    rows = read_csv(Path(path), "force curve", EvaluationError)
+    return [(line, cells[: max(i for i, cell in enumerate(cells) if cell) + 1]) for line, cells in rows] or [(1, [""])]
 
 
 def _column(path: str | Path, titles: Sequence[str], asked: str | None) -> str:
@@ -214,7 +202,7 @@ def _column(path: str | Path, titles: Sequence[str], asked: str | None) -> str:
 
 def _newtons(path: str | Path, column: str) -> float:
     """Newtons in the unit that the name of a column ends in; 1 if it ends in none."""
-    unit = column.rpartition("_")[2]
+    unit = name_and_unit(column)[1]
     if unit not in FORCE_UNITS and unit.lower() in _OTHER_UNITS:
         raise EvaluationError(
             f"{path}: column '{column}' ends in '{unit}', which is no unit of force that is known: give one of "
@@ -236,9 +224,17 @@ def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, flo
     return found
 
 
+def name_and_unit(header: str) -> tuple[str, str]:
+    """Both parts of a column's header, "stroke_mm" or "stroke [mm]"."""
+    if bracketed := _BRACKETED.fullmatch(header):
+        return bracketed[1], bracketed[2]
+    name, _, unit = header.rpartition("_")
+    return name, unit
+
+
 def parameter_of_column(header: str, model: ReducedModel) -> tuple[str, float] | None:
     """The parameter that a column such as ``stroke_mm`` holds, and the factor of its values to SI; None if none."""
-    name, _, unit = header.rpartition("_")
+    name, unit = name_and_unit(header)
     for parameter in model.parameters:
         if parameter.name == name and unit in FACTORS[parameter.quantity]:
             return name, FACTORS[parameter.quantity][unit]

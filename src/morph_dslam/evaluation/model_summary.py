@@ -128,7 +128,9 @@ def main_errors(errors: Mapping[str, Any]) -> dict[str, float]:
 
 def _in_words(figures: Mapping[str, float]) -> str:
     displacement = f"displacement {figures['mean']:.2g} mm mean, {figures['largest']:.2g} mm at most"
-    relative = [f"{name} {value:.2g} %" for name, value in figures.items() if name not in ("mean", "largest")]
+    relative = [
+        f"{name} {float(f'{value:.2g}'):g} %" for name, value in figures.items() if name not in ("mean", "largest")
+    ]
     return ", ".join([displacement, *relative]) + (" (relative L2)" if relative else "")
 
 

@@ -7,7 +7,6 @@ error along the sight line.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.points import OUTLINE_TOLERANCE_PX, bind_pixels, millimetres
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.io.text import read_text
+from morph_dslam.io.text import read_csv
 from morph_dslam.model import SurfacePoints
 
 Array = NDArray[np.float64]
@@ -56,16 +55,13 @@ def load_tracks(path: str | Path) -> PixelTracks:
         If the file is missing, lacks a column or a measurement, or a line has no frame, no id or no numbers, or names
         a track for the second time in a frame.
     """
-    reader = csv.reader(read_text(Path(path), "tracks", EvaluationError).splitlines())
-    header = [cell.strip() for cell in next(reader, [])]
+    (_, header), *rows = read_csv(Path(path), "tracks", EvaluationError) or [(1, [])]
     if missing := [name for name in HEADER if name not in header]:
         raise EvaluationError(f"{path} has no column {', '.join(missing)}; its first line must name {','.join(HEADER)}")
     columns = [header.index(name) for name in HEADER]
     measured: dict[tuple[int, str], tuple[float, float]] = {}
-    for row in reader:
-        if not any(cell.strip() for cell in row):
-            continue
-        where = f"{path}, line {reader.line_num}"
+    for line, row in rows:
+        where = f"{path}, line {line}"
         frame, name, u, v = _measurement(where, row, columns)
         if (frame, name) in measured:
             raise EvaluationError(f"{where}: track '{name}' occurs twice in frame {frame}")
@@ -77,7 +73,7 @@ def load_tracks(path: str | Path) -> PixelTracks:
 
 def _measurement(where: str, row: Sequence[str], columns: Sequence[int]) -> tuple[int, str, float, float]:
     try:
-        frame, name, u, v = (row[column].strip() for column in columns)
+        frame, name, u, v = (row[column] for column in columns)
         values = int(frame), name, float(u or "nan"), float(v or "nan")
     except (ValueError, IndexError):
         values = -1, "", 0.0, 0.0

@@ -9,6 +9,7 @@ motion is.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.points import MaterialError, millimetres
+from morph_dslam.evaluation.trajectory_notes import clock_advice, pair_notes, pose_notes, size_notes
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.slam.map_files import is_metric_map
@@ -126,7 +128,7 @@ def match(estimate: Trajectory, truth: Trajectory, most: float = MOST_TIME_DIFFE
         spans = [f"{t.timestamps[0]:.3f} to {t.timestamps[-1]:.3f} s" for t in (estimate, truth)]
         raise EvaluationError(
             f"only {len(pairs)} poses of estimate and truth are within {most:g} s of each other; the "
-            f"estimate spans {spans[0]}, the truth {spans[1]}: give the truth of this recording, on its clock"
+            f"estimate spans {spans[0]}, the truth {spans[1]}: {clock_advice(estimate, truth)}"
         )
     rows, columns = pairs.T
     return (
@@ -212,10 +214,10 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     else:
         path = _trajectory_file(Path(run))
         loaded = load_trajectory(path)
-    in_memory = isinstance(truth, Trajectory)
-    estimate, expected = match(loaded, truth if in_memory else load_trajectory(Path(truth)))
+    whole = truth if isinstance(truth, Trajectory) else load_trajectory(Path(truth))
+    estimate, expected = match(loaded, whole)
     figures: dict[str, Any] = {
-        "truth": None if in_memory else str(truth),
+        "truth": None if isinstance(truth, Trajectory) else str(truth),
         "n_poses": len(loaded),
         "n_pairs": len(estimate),
         "truth_length_m": expected.length,
@@ -236,6 +238,8 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
             "relative_deg": statistics(np.rad2deg(relative.rotations)),
         }
         errors[name] = absolute, relative
+    mistakes = [*pair_notes(len(estimate), loaded, whole), *pose_notes(estimate, expected)]
+    figures["notes"] = [*mistakes, *_scale_notes(figures, bool(mistakes))]
     if path is not None:
         path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
         plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, expected, *errors["sim3"])
@@ -261,13 +265,22 @@ def _interval(trajectory: Trajectory) -> float:
     return max(min(INTERVAL, 0.5 * float(times[-1] - times[0])), float(np.median(np.diff(times))))
 
 
+def _scale_notes(figures: dict[str, Any], are_wrong: bool) -> Iterator[str]:
+    """What a reader must know of the lengths of an evaluated path; ``are_wrong``: its times or poses are."""
+    rigid, similar = figures["se3"], figures["sim3"]
+    if rigid is None:
+        yield SCALE_UNKNOWN
+    elif not are_wrong:
+        yield from size_notes(similar["scale"], rigid["absolute_mm"]["rmse"], similar["absolute_mm"]["rmse"])
+
+
 def trajectory_line(figures: dict[str, Any]) -> str:
-    """The line that sums up an evaluation, below a note where the scale of the run is unknown."""
+    """The line that sums up an evaluation, below its notes."""
     rigid, similar = figures["se3"], figures["sim3"]
     without_scale = np.nan if rigid is None else rigid["absolute_mm"]["rmse"]
-    note = "" if rigid is not None else f"note: {SCALE_UNKNOWN}\n"
+    notes = "".join(f"note: {note}\n" for note in figures["notes"])
     return (
-        f"{note}pairs={figures['n_pairs']}/{figures['n_poses']} "
+        f"{notes}pairs={figures['n_pairs']}/{figures['n_poses']} "
         f"ate_se3_mm={without_scale:.2f} ate_sim3_mm={similar['absolute_mm']['rmse']:.2f} "
         f"scale={similar['scale']:.4f} rpe_mm={similar['relative_mm']['rmse']:.2f} "
         f"rpe_deg={similar['relative_deg']['rmse']:.3f}"

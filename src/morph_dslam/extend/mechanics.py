@@ -17,6 +17,7 @@ from morph_dslam.mechanics.loads import (
     MovingPatch as MovingPatch,
     NodalForces as NodalForces,
     PointLoad as PointLoad,
+    SurfaceForce as SurfaceForce,
 )
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden as HolzapfelGasserOgden
 from morph_dslam.mechanics.materials.base import (
@@ -62,5 +63,10 @@ from morph_dslam.meshing.generators import Profile as Profile, block as block, r
 from morph_dslam.meshing.inp_writing import save_mesh as save_mesh
 from morph_dslam.meshing.mesh_checks import check_mesh as check_mesh
 from morph_dslam.meshing.mesh_files import load_mesh as load_mesh
+from morph_dslam.meshing.mesh_summary import (
+    SET_COLUMNS as SET_COLUMNS,
+    described_mesh as described_mesh,
+    set_rows as set_rows,
+)
 from morph_dslam.meshing.meshes import CellBlock as CellBlock, Mesh as Mesh, model_mesh_of as model_mesh_of
 from morph_dslam.meshing.second_order import to_second_order as to_second_order

@@ -1,5 +1,6 @@
-"""What reduced models are made of: separated fields, functions of the parameters, points that a model carries."""
+"""What reduced models are made of: separated fields, functions, points that a model carries; and what a file is."""
 
+from morph_dslam.io.file_kinds import MESHES as MESHES, file_kind as file_kind
 from morph_dslam.model import (
     MaterialPoints as MaterialPoints,
     SeparatedField as SeparatedField,

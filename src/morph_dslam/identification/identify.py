@@ -28,6 +28,8 @@ FACTOR, FACTOR_RANGE = "moduli_factor", (0.01, 100.0)
 STARTS, ROUNDS = 8, 4
 #: An estimate so near to an end of its range, over the range, is at it.
 AT_THE_END = 1e-6
+#: Logarithms of factors are cut here.
+LARGEST = 700.0
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,8 @@ class _Fit:
 
     def _si(self, theta: Array) -> Array:
         inner = self._ends[:, 0] + theta * np.diff(self._ends, axis=1)[:, 0]
-        return np.where(self._log, np.exp(np.where(self._log, inner, 0.0)), inner)
+        # An interval may be wider than numbers reach.
+        return np.where(self._log, np.exp(np.where(self._log, np.clip(inner, -LARGEST, LARGEST), 0.0)), inner)
 
     def _misfits(self, theta: Array) -> list[Misfit]:
         values = _Values(self._model, self._unknowns, self._si(theta))

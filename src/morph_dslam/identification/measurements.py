@@ -6,7 +6,6 @@ or along a stretch of a force curve, are not independent of each other.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,16 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.evaluation.force import ForceCurve, ReactionInDirection, parameter_columns, parameter_of_column
+from morph_dslam.evaluation.force import (
+    ForceCurve,
+    ReactionInDirection,
+    name_and_unit,
+    parameter_columns,
+    parameter_of_column,
+)
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.io.text import read_text
-from morph_dslam.model import MaterialPoints, ReducedModel
+from morph_dslam.io.text import read_csv
+from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
+from morph_dslam.model.reduced_model import FORCE, REACTION
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]
-#: Columns of a table of points: where they are on the undeformed object, and where they were measured.
+#: Columns of a table of points: the state, where they are on the undeformed object, and where they were measured.
+STATE = "state"
 PLACE, MEASURED = ("place_x", "place_y", "place_z"), ("x", "y", "z")
+OWN = (STATE, *PLACE, *MEASURED)
 #: Points farther off the undeformed surface than this share of the object's size are a mistake.
 FARTHEST = 0.25
 #: A force curve counts as so many stretches whose errors are independent of each other.
@@ -53,6 +61,18 @@ class Measurement(Protocol):
 
     @property
     def name(self) -> str: ...
+    @property
+    def model(self) -> ReducedModel: ...
+    @property
+    def field(self) -> str:
+        """The field of the model that predicts the values."""
+        ...
+
+    @property
+    def given(self) -> frozenset[str]:
+        """Names of the parameters that it gives; those that are not identified either have their defaults."""
+        ...
+
     @property
     def unit(self) -> str:
         """Of errors in reports."""
@@ -104,9 +124,14 @@ class MeasuredPoints:
     places: Array
     measured: Array
     name = "points"
+    field = "displacement"
     unit = "mm"
     scale = 1e3
     has_offset = False
+
+    @property
+    def given(self) -> frozenset[str]:
+        return frozenset(self.known)
 
     @property
     def values(self) -> Array:
@@ -171,39 +196,102 @@ def _frames(triangles: Array) -> Array:
 
 
 def load_points(path: str | Path, model: ReducedModel) -> MeasuredPoints:
-    """Read a table of points: CSV with a header.
+    """Read a table of points: CSV with a line of titles.
 
     Columns are ``state`` (a name), known parameters with their unit (``load_N``), where the point is on the undeformed
     object (``place_x_mm`` and so on), and where it was measured (``x_mm`` and so on; cells may be empty).
 
+    Parameters
+    ----------
+    path : the file.
+    model : whose parameters may be known.
+
     Raises
     ------
     IdentificationError
-        If the file is missing, a column is missing or not known, or a value is no number.
+        If the file is missing, a column is missing or not known, a line is cut short, a value is no number, or a known
+        parameter is outside of its range or has two values in a state.
     """
-    rows = list(csv.DictReader(read_text(Path(path), "table of points", IdentificationError).splitlines()))
-    columns = [name for name in (rows[0] if rows else {}) if name]
-    known = {name: _parameter(path, name, model) for name in columns if not _is_own(name)}
-    missing = [name for name in (*PLACE, *MEASURED) if not any(column.rpartition("_")[0] == name for column in columns)]
-    if not rows or missing or "state" not in columns:
-        lacking = ["state"] * ("state" not in columns) + [f"{name}_mm" for name in missing]
-        raise IdentificationError(f"{path} has no column {', '.join(lacking) or 'with a point'}: docs/identify.md")
-    places, measured = (_coordinates(path, rows, columns, names) for names in (PLACE, MEASURED))
+    table = _PointTable(path)
+    known = {title: _parameter(path, title, model) for title in table.titles if _name(title) not in OWN}
+    places, measured = (table.coordinates(names) for names in (PLACE, MEASURED))
     if not np.isfinite(places).all():
         raise IdentificationError(f"{path}: every row needs {', '.join(PLACE)}")
     if not np.isfinite(measured).any():
         raise IdentificationError(f"{path}: no point was measured: columns {', '.join(MEASURED)} are empty")
-    values = {
-        parameter: factor * np.array([_number(path, row[column]) for row in rows])
-        for column, (parameter, factor) in known.items()
-    }
-    if unknown := next((name for name, column in values.items() if not np.isfinite(column).all()), None):
-        raise IdentificationError(f"{path}: parameter '{unknown}' is not given in every row")
-    return MeasuredPoints(model, tuple(row["state"] or "" for row in rows), values, places, measured)
+    parameters = {parameter.name: parameter for parameter in model.parameters}
+    values = {name: table.known(title, parameters[name], factor) for title, (name, factor) in known.items()}
+    return MeasuredPoints(model, tuple(table.states), values, places, measured)
 
 
-def _is_own(column: str) -> bool:
-    return column == "state" or column.rpartition("_")[0] in (*PLACE, *MEASURED)
+class _PointTable:
+    """The lines of a file of points, each with a cell under every title."""
+
+    def __init__(self, path: str | Path) -> None:
+        (_, titles), *rows = read_csv(Path(path), "table of points", IdentificationError) or [(1, [])]
+        names = [_name(title) for title in titles]
+        if missing := [name for name in OWN if name not in names]:
+            lacking = ", ".join(name if name == STATE else f"{name}_mm" for name in missing)
+            raise IdentificationError(f"{path} has no column {lacking}; its first line must name the columns")
+        if not rows:
+            raise IdentificationError(f"{path} has no points below its titles")
+        for line, cells in rows:
+            if len(cells) < len(titles) or any(cells[len(titles) :]):
+                raise IdentificationError(
+                    f"{path}, line {line}: {len(cells)} cells under {len(titles)} titles; keep the commas of empty "
+                    "cells, and write decimals with points"
+                )
+        self._path, self._rows = path, rows
+        self._columns = {title: at for at, title in enumerate(titles) if title}
+        self.titles, self.states = list(self._columns), [cells[names.index(STATE)] for _, cells in rows]
+
+    def numbers(self, title: str) -> Array:
+        """A column (r,), NaN where a cell is empty."""
+        return np.array([self._number(line, title, cells[self._columns[title]]) for line, cells in self._rows])
+
+    def _number(self, line: int, title: str, cell: str) -> float:
+        try:
+            value = float(cell or "nan")
+        except ValueError:
+            value = np.inf
+        if np.isinf(value):
+            raise IdentificationError(f"{self._path}, line {line}, column '{title}': '{cell}' is not a number")
+        return value
+
+    def coordinates(self, names: tuple[str, ...]) -> Array:
+        """Columns (r, 3) of lengths, m; NaN where a cell is empty."""
+        found = []
+        for name in names:
+            title = next(title for title in self.titles if _name(title) == name)
+            unit = name_and_unit(title)[1]
+            if unit not in FACTORS["length"]:
+                raise IdentificationError(f"{self._path}: column '{title}' needs a unit of length: {name}_mm, say")
+            found.append(FACTORS["length"][unit] * self.numbers(title))
+        return np.column_stack(found)
+
+    def known(self, title: str, parameter: Parameter, factor: float) -> Array:
+        """Values (r,) of a parameter, SI: one in each state, in its range."""
+        values, first = factor * self.numbers(title), dict[str, tuple[int, float]]()
+        for (line, _), state, value in zip(self._rows, self.states, values.tolist(), strict=True):
+            where = f"{self._path}, line {line}, column '{title}'"
+            if np.isnan(value):
+                raise IdentificationError(f"{where} is empty: parameter '{parameter.name}' must be given in every row")
+            if not parameter.in_range(value):
+                raise IdentificationError(
+                    f"{where}: {parameter.text(value)} is outside of the model's range, {parameter.range_text}"
+                )
+            line_before, before = first.setdefault(state, (line, value))
+            if value != before:
+                raise IdentificationError(
+                    f"{where}: state '{state}' has {parameter.text(value)} here and {parameter.text(before)} in line "
+                    f"{line_before}: give each state one value, or make them two states"
+                )
+        return values
+
+
+def _name(title: str) -> str:
+    """Of a column, without the unit."""
+    return title if title == STATE else name_and_unit(title)[0]
 
 
 def _parameter(path: str | Path, column: str, model: ReducedModel) -> tuple[str, float]:
@@ -214,29 +302,6 @@ def _parameter(path: str | Path, column: str, model: ReducedModel) -> tuple[str,
             f"{path}: column '{column}' is no parameter of the model with its unit: {parameter_columns(model)}"
         )
     return found
-
-
-def _coordinates(path: str | Path, rows: list[dict[str, str]], columns: list[str], names: tuple[str, ...]) -> Array:
-    """Columns (r, 3) of lengths, m; NaN where a cell is empty."""
-    result = np.empty((len(rows), 3))
-    for axis, name in enumerate(names):
-        column = next(column for column in columns if column.rpartition("_")[0] == name)
-        unit = column.rpartition("_")[2]
-        if unit not in FACTORS["length"]:
-            raise IdentificationError(f"{path}: column '{column}' needs a unit of length: {name}_mm, say")
-        result[:, axis] = [FACTORS["length"][unit] * _number(path, row[column]) for row in rows]
-    return result
-
-
-def _number(path: str | Path, cell: str | None) -> float:
-    """The number in a cell, NaN where it is empty."""
-    try:
-        value = float(cell or "nan")
-    except ValueError:
-        value = np.inf
-    if np.isinf(value):
-        raise IdentificationError(f"{path}: '{cell}' is not a number")
-    return value
 
 
 @dataclass(frozen=True)
@@ -266,20 +331,48 @@ class MeasuredForces:
             raise IdentificationError("forces by frame need the run that tracked these frames: give --run")
         if len(self.values) < FEWEST_FORCES:
             raise IdentificationError(
-                f"{len(self.values)} forces are left to compare, and {FEWEST_FORCES} are needed: the others are in "
-                "frames that were not tracked"
+                f"{len(self.values)} forces of {self.name} are left to compare, and {FEWEST_FORCES} are needed: "
+                f"the others are {self.why_left_out}"
             )
 
     @property
     def name(self) -> str:
         return self.curve.name
 
+    @property
+    def field(self) -> str:
+        return f"{REACTION}{FORCE}{self.reaction.support}"
+
+    @property
+    def given(self) -> frozenset[str]:
+        return frozenset(self._known[0])
+
+    @cached_property
+    def _against(self) -> Parameter | None:
+        """The parameter that the curve is given by; None where it is given by frame."""
+        return next((p for p in self.model.parameters if p.name == self.curve.against), None)
+
     @cached_property
     def _rows(self) -> NDArray[np.int64]:
-        """Of the curve: those in tracked frames, or all."""
-        if self.curve.against != "frame" or self.run is None:
+        """Of the curve: those in tracked frames, or where the model has solutions."""
+        if self._against is not None:
+            # Beyond its range a model only repeats its last state.
+            return np.flatnonzero([self._against.in_range(place) for place in self.curve.places])
+        if self.run is None:
             return np.arange(len(self.curve.places))
         return np.flatnonzero(np.isin(self.curve.places, self.run.frames[self.run.tracked]))
+
+    @property
+    def left_out(self) -> int:
+        """How many forces of the curve are not compared."""
+        return len(self.curve.places) - len(self._rows)
+
+    @property
+    def why_left_out(self) -> str:
+        """What those are, for people."""
+        if self._against is None:
+            return "in frames that were not tracked"
+        return f"outside of the model's range of {self._against.name}, {self._against.range_text}"
 
     @property
     def values(self) -> Array:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from morph_dslam.evaluation.force import reaction_remark
-from morph_dslam.identification.identify import Estimate, Identification, Misfit
+from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
 from morph_dslam.model import Parameter
 
@@ -26,7 +26,7 @@ def summarise(found: Identification) -> dict[str, Any]:
     return {
         "parameters": [_figures(each) for each in found.estimates],
         "correlation": dict(zip(names, rows, strict=True)),
-        "measurements": [_misfit_figures(misfit) for misfit in found.misfits],
+        "measurements": [_misfit_figures(misfit, names) for misfit in found.misfits],
         "groups": found.groups,
     }
 
@@ -44,8 +44,10 @@ def _figures(each: Estimate) -> dict[str, Any]:
     }
 
 
-def _misfit_figures(misfit: Misfit) -> dict[str, Any]:
+def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]:
     measurement = misfit.measurement
+    known, model = {*measurement.given, *identified}, measurement.model
+    discretisation = model.certificate.get("discretisation", {}).get("errors", {}).get(measurement.field)
     figures = {
         "name": measurement.name,
         "unit": measurement.unit,
@@ -53,11 +55,19 @@ def _misfit_figures(misfit: Misfit) -> dict[str, Any]:
         "groups": len(np.unique(measurement.groups)),
         "rms": measurement.scale * misfit.rms,
         "largest": measurement.scale * float(np.abs(misfit.predicted - measurement.values).max()),
+        "at_default": [
+            {"name": p.name, "unit": p.unit, "value": p.display(p.default)}
+            for p in model.study_parameters
+            if p.name not in known
+        ],
+        "discretisation_error": None if discretisation is None else discretisation["relative_l2"],
     }
     if isinstance(measurement, MeasuredForces):
         units = {p.name: p for p in measurement.model.parameters}
         rates = measurement.loading_rates.items()
         figures |= {"support": measurement.compared.support, "direction": measurement.compared.direction}
+        figures |= {"left_out": measurement.left_out}
+        figures |= {"why": f"they are {measurement.why_left_out}"} if measurement.left_out else {}
         figures["loading_rate_per_frame"] = {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates}
     return figures | ({"offset": measurement.scale * misfit.offset} if measurement.has_offset else {})
 
@@ -90,11 +100,15 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
             f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
             "intervals are rough"
         )
+    said += [*_not_in_intervals(figures["measurements"]), *_at_default(figures["measurements"], FACTOR in names)]
     for each in figures["measurements"]:
         offset = f", offset {each['offset']:.3g} {each['unit']}" if "offset" in each else ""
         said.append(f"{each['name']}: {each['values']} values missed by {each['rms']:.3g} {each['unit']} rms{offset}")
         if "support" in each:
             said.append(f"note: {each['name']} is compared with {reaction_remark(each)}")
+        if each.get("left_out"):
+            of = each["left_out"] + each["values"]
+            said.append(f"note: {each['left_out']} of {of} forces of {each['name']} are left out: {each['why']}")
         rates = each.get("loading_rate_per_frame")
         if rates is not None:
             rate = ", ".join(f"{name} {rate:.3g} a frame" for name, rate in rates.items())
@@ -102,6 +116,37 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
                 f"loading rate: {rate or 'not known, forces are not given by frame'}; moduli may differ at others"
             )
     return said
+
+
+def _not_in_intervals(measurements: Sequence[Mapping[str, Any]]) -> list[str]:
+    """By how much the model errs in each measurement because its elements are no finer, if its file says so."""
+    parts = [
+        f"{100.0 * each['discretisation_error']:.2g} % of the "
+        + (f"force on '{each['support']}'" if "support" in each else "displacement")
+        for each in measurements
+        if each["discretisation_error"] is not None
+    ]
+    return [f"note: intervals do not contain the model's discretisation error: {', '.join(parts)}"] if parts else []
+
+
+def _at_default(measurements: Sequence[Mapping[str, Any]], scaled: bool) -> list[str]:
+    """Which parameters have their defaults because nothing gives them.
+
+    Parameters
+    ----------
+    measurements : their figures.
+    scaled : whether a common factor of all moduli was identified.
+    """
+    of: dict[str, list[str]] = {}
+    for each in measurements:
+        values = [f"{p['name']} = {p['value']:.4g} {p['unit']}".removesuffix(" 1") for p in each["at_default"]]
+        of.setdefault(", ".join(values), []).append(each["name"])
+    end = f"; {FACTOR} multiplies the moduli there" if scaled else ""
+    return [
+        f"note: parameters that nothing gives have their defaults for {', '.join(names)}: {values}{end}"
+        for values, names in of.items()
+        if values
+    ]
 
 
 def last_line(figures: Mapping[str, Any]) -> str:

@@ -161,13 +161,16 @@ def save_camera(path: Path, camera: Camera) -> None:
 
 
 def _read_yaml(path: Path) -> object:
-    """The content of a YAML file, which may have OpenCV's header `%YAML:1.0` and its matrices."""
+    """The content of a YAML file, which may have OpenCV's header `%YAML:1.0` and its matrices.
+
+    Of several documents the first: `rostopic echo` writes the line that begins another one after each message.
+    """
     lines = read_text(path, "camera file", CameraError).splitlines()
     if lines and lines[0].startswith("%YAML:"):
         # YAML writes this directive with a space, and a document that follows one begins with ---.
         lines = lines[1:]
     try:
-        return yaml.load("\n".join(lines), Loader=_Loader)
+        return next(yaml.load_all("\n".join(lines), Loader=_Loader), None)
     except yaml.YAMLError as error:
         raise CameraError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from xml.etree import ElementTree
 
 import h5py
@@ -21,17 +22,18 @@ from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from morph_dslam.errors import ExportError
+from morph_dslam.errors import ExportError, StudyError
 from morph_dslam.io.gltf import Colours, write_glb
+from morph_dslam.io.text import read_csv
 from morph_dslam.model import Parameter, ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
-from morph_dslam.units import to_si
+from morph_dslam.model.shown_field import shown_field
+from morph_dslam.units import read_quantity, to_si
 
 Array = NDArray[np.float64]
+FileFormat = Literal["xdmf", "vtu", "gltf"]
 #: States that one export may have: beyond, a grid was meant to be coarser.
 MOST_STATES = 10_000
-#: Values may pass the end of a range by so much of its width: tables round.
-_ROUNDING = 1e-6
 #: States of a tour from the default to one end of a range; twice as many cross it.
 _QUARTER = 6
 
@@ -43,15 +45,11 @@ def _index(model: ReducedModel, name: str) -> int:
     return names.index(name)
 
 
-def _to_range(parameter: Parameter, value: float, where: str) -> float:
-    """A value in the parameter's unit as SI, checked to lie in its range."""
-    si = to_si(value, parameter.unit, parameter.quantity)
-    slack = _ROUNDING * (parameter.upper - parameter.lower)
-    if not parameter.lower - slack <= si <= parameter.upper + slack:  # NaN as well
-        low, high = (parameter.display(bound) for bound in (parameter.lower, parameter.upper))
-        raise ExportError(
-            f"{where}: {value:g} is outside the range of {parameter.name}, {low:g} to {high:g} {parameter.unit}"
-        )
+def _in_range(parameter: Parameter, si: float, where: str) -> float:
+    """A value in SI, checked to lie in the parameter's range."""
+    if not parameter.in_range(si):
+        shown = f"{parameter.display(si):g} is outside the range of {parameter.name}"
+        raise ExportError(f"{where}: {shown}, {parameter.range_text}")
     return min(max(si, parameter.lower), parameter.upper)
 
 
@@ -61,7 +59,7 @@ def fixed_values(model: ReducedModel, settings: Sequence[str]) -> Array:
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals:
-            raise ExportError(f"--at {text} is not a parameter and its value, such as bend=12.5")
+            raise ExportError(f"--at {text} is not a parameter and its value{_example(model, '{0}={1}')}")
         k = _index(model, name)
         mu[k] = _number(model.parameters[k], value, f"--at {text}")
     return mu
@@ -76,18 +74,14 @@ def grid(model: ReducedModel, ranges: Sequence[str], base: Array) -> Array:
     """
     axes: dict[int, Array] = {}
     for text in ranges:
-        try:
-            name, _, limits = text.partition("=")
-            first, last, count = limits.split(":")
-            ends, n = (float(first), float(last)), int(count)
-        except ValueError:
-            n, name, ends = 0, "", (0.0, 0.0)
-        if n < 1 or not name:
-            raise ExportError(f"--vary {text} is not a parameter and its values, such as bend=-10:10:21")
-        k = _index(model, name)
+        name, _, limits = text.partition("=")
+        parts = limits.split(":")
+        if len(parts) != 3 or not name or not parts[2].isdecimal() or int(parts[2]) < 1:
+            raise ExportError(f"--vary {text} is not a parameter and its values{_example(model, '{0}={1}:{2}:21')}")
+        k, n = _index(model, name), int(parts[2])
         if k in axes:
             raise ExportError(f"--vary {text}: parameter '{name}' has a range already")
-        low, high = (_to_range(model.parameters[k], end, f"--vary {text}") for end in ends)
+        low, high = (_number(model.parameters[k], end, f"--vary {text}") for end in parts[:2])
         if n > MOST_STATES:
             raise ExportError(f"--vary {text} asks for {n} states, and {MOST_STATES} is the most")
         axes[k] = np.linspace(low, high, n)
@@ -119,23 +113,18 @@ def read_path(model: ReducedModel, path: Path, base: Array) -> Array:
     of a run. Other columns are passed over, and so are rows without values: frames that were not tracked.
     Parameters without a column keep their value in ``base``.
     """
-    try:
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-            header = list(rows[0]) if rows else []
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ExportError(f"cannot read the path {path}: {error}") from error
+    (_, header), *rows = read_csv(path, "path", ExportError) or [(1, [])]
     columns = {}
     for k, p in enumerate(model.parameters):
         found = [name for name in (f"{p.name} [{p.unit}]", f"{p.name}_{p.unit}") if name in header]
         if found:
-            columns[k] = found[0]
+            columns[k] = header.index(found[0])
     if not columns:
         wanted = ", ".join(f"'{p.name} [{p.unit}]'" for p in model.parameters)
         raise ExportError(f"{path} has no column of a parameter; name the columns {wanted}")
     states = []
-    for line, row in enumerate(rows, start=2):
-        texts = {k: (row[name] or "").strip() for k, name in columns.items()}
+    for line, row in rows:
+        texts = {k: row[column] if column < len(row) else "" for k, column in columns.items()}
         if not all(texts.values()):
             continue
         mu = base.copy()
@@ -148,11 +137,44 @@ def read_path(model: ReducedModel, path: Path, base: Array) -> Array:
 
 
 def _number(parameter: Parameter, text: str, where: str) -> float:
+    """A value in the parameter's unit, or with another unit behind it, as SI."""
     try:
-        value = float(text)
+        value = to_si(float(text), parameter.unit, parameter.quantity)
     except ValueError:
-        raise ExportError(f"{where}: '{text}' is not a value of {parameter.name}") from None
-    return _to_range(parameter, value, where)
+        try:
+            value = read_quantity(text, parameter.quantity)
+        except StudyError as error:
+            raise ExportError(
+                f"{where}: '{text}' is not a value of {parameter.name}: write a number in {parameter.unit}, or with "
+                f"another unit: {error}"
+            ) from None
+    return _in_range(parameter, value, where)
+
+
+def _example(model: ReducedModel, form: str) -> str:
+    """The end of a message: how to write it for a parameter that the model has, from its name and its range's ends."""
+    if not model.parameters:
+        return f": '{model.name}' has no parameters"
+    p = model.parameters[0]
+    return ", such as " + form.format(p.name, *(f"{p.display(end):.4g}" for end in (p.lower, p.upper)))
+
+
+def states_of_array(model: ReducedModel, choice: ArrayLike) -> Array:
+    """Parameters (s, d) or (d,), SI, as states; ExportError where they are none of the model's."""
+    d = len(model.parameters)
+    try:
+        states = np.atleast_2d(np.array(choice, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ExportError("states are a StateChoice, or an array of parameters (s, d)") from None
+    if states.ndim != 2 or states.shape[1] != d or not 0 < len(states) <= MOST_STATES:
+        names = ", ".join(p.name for p in model.parameters) or "none"
+        raise ExportError(
+            f"an array of states has a row for each, 1 to {MOST_STATES}, and a column for each of the parameters "
+            f"({names}), not the shape {states.shape}"
+        )
+    for number, row in enumerate(states):
+        states[number] = [_in_range(p, x, f"state {number}") for p, x in zip(model.parameters, row, strict=True)]
+    return states
 
 
 def write_table(path: Path, model: ReducedModel, states: Array, places: Sequence[dict[str, str | int]]) -> None:
@@ -213,8 +235,17 @@ def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock
     return result
 
 
+def _remove_series(folder: Path, stem: str) -> None:
+    """Remove the states of a series of this name that was written before: they would pass for states of the next."""
+    series = folder / f"{stem}.pvd"
+    written = series.read_text(errors="replace") if series.is_file() else ""
+    for name in re.findall(rf'file="({re.escape(stem)}_\d{{4}}\.vtu)"', written):
+        (folder / name).unlink(missing_ok=True)
+
+
 def write_vtu_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
     """One ``stem_0000.vtu`` a state (s, d), ``stem.pvd`` to open all, ``states.csv``; returns the .pvd."""
+    _remove_series(folder, stem)
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
     cells, places = _cells(model), []
@@ -282,16 +313,18 @@ class StateChoice:
 def export(
     model: str | Path | ReducedModel,
     folder: str | Path,
-    file_format: Literal["xdmf", "vtu", "gltf"] = "xdmf",
+    file_format: FileFormat = "xdmf",
     choice: StateChoice | ArrayLike = StateChoice(),
     show: Colours | None = None,
 ) -> Path:
     """Write a model's states for ParaView or as an animation; returns the file to open.
 
+    Files are called as the model's file, or as the model itself if it is given as a `ReducedModel`.
+
     Parameters
     ----------
     model : a model or its file.
-    folder : to write into; made if missing.
+    folder : to write into; made if missing. Files of an export of the same name are replaced.
     file_format : "xdmf" or "vtu" for ParaView, "gltf" for 3-D viewers.
     choice : of the states, by default each parameter in turn; or their parameters (s, d), SI.
     show : what colours a glTF file: "stress" (von Mises), "strain" (equivalent), "displacement", or "none"; by default
@@ -304,15 +337,19 @@ def export(
     ParameterError
         If the model does not hold what is to be shown.
     ExportError
-        If the states are not in the model's box, or the folder cannot be written.
+        If there is no such format, the states are not in the model's box, or the folder cannot be written.
     """
+    if file_format not in get_args(FileFormat):
+        raise ExportError(f"'{file_format}' is no format of an export; these are {', '.join(get_args(FileFormat))}")
     if show is not None and file_format != "gltf":
         raise ExportError("show (--show) chooses the colours of a glTF file; XDMF and VTU files hold all fields")
     if isinstance(model, ReducedModel):
-        loaded, stem = model, model.name
+        loaded, stem = model, _file_name(model.name)
     else:
         loaded, stem = load_model(model), Path(model).stem
-    states = choice.states(loaded) if isinstance(choice, StateChoice) else np.atleast_2d(choice)
+    states = choice.states(loaded) if isinstance(choice, StateChoice) else states_of_array(loaded, choice)
+    if show != "none":
+        shown_field(loaded, show)  # before a folder is made
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -325,3 +362,8 @@ def export(
         return write(folder, stem, loaded, states)
     except OSError as error:
         raise ExportError(f"cannot write to {folder}: {error.strerror or error}") from error
+
+
+def _file_name(name: str) -> str:
+    """A model's name as that of a file."""
+    return re.sub(r"[^\w.+-]+", "_", name).strip("._") or "model"

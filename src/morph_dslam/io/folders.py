@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from morph_dslam.errors import TrackingError
+
+if sys.platform != "win32":
+    import fcntl
 
 
 def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> None:
@@ -25,10 +32,50 @@ def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> N
         raise TrackingError(
             f"{folder} holds a run already: choose another folder, or allow it to be overwritten (`--overwrite`)"
         )
+    _make(folder)
+    # They would stand in the report of the new run.
+    for old in folder.glob("*evaluation.json"):
+        old.unlink()
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Keep other runs out of a run folder, which is made if it is not there, while the context lasts.
+
+    The folder itself is locked, so that no file is left behind and the lock of a process that dies goes with it. On
+    Windows, and on drives that know no locks, other runs are not kept out.
+
+    Parameters
+    ----------
+    folder : of the run.
+
+    Raises
+    ------
+    TrackingError
+        If it cannot be made, or another run is writing to it.
+    """
+    _make(folder)
+    if sys.platform == "win32":
+        yield
+        return
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(opened)
+        raise TrackingError(
+            f"another run is writing to {folder}: wait until it ends, or choose another folder"
+        ) from None
+    except OSError:  # no locks on this drive
+        pass
+    try:
+        yield
+    finally:
+        os.close(opened)
+
+
+def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise TrackingError(f"cannot write the run to {folder}: {error.strerror}") from error
-    # They would stand in the report of the new run.
-    for old in folder.glob("*evaluation.json"):
-        old.unlink()

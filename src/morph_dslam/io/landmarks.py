@@ -6,7 +6,6 @@ Landmarks in the map of a scene have the number of their frame before it, in a f
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.io.text import read_text
+from morph_dslam.io.text import read_csv
 
 #: No millimetres or pixels are meant by what is larger.
 LARGEST = 1e7
@@ -24,18 +23,38 @@ HEADER = ("x_mm", "y_mm", "z_mm", "u_px", "v_px")
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Points of an object and their pixels.
+    """Points of an object and their pixels, as arrays or lists.
 
     Attributes
     ----------
     points : (k, 3) on the undeformed object in its frame, metres
     pixels : (k, 2) in the image as recorded
     frames : (k,) numbers of the frames in which they were set; None where all are of the reference frame
+
+    Raises
+    ------
+    RegistrationError
+        If these are no numbers, or not of as many landmarks.
     """
 
     points: NDArray[np.float64]
     pixels: NDArray[np.float64]
     frames: NDArray[np.int64] | None = None
+
+    def __post_init__(self) -> None:
+        for name, columns in (("points", 3), ("pixels", 2)):
+            try:
+                values = np.asarray(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise RegistrationError(f"{name} of landmarks are no numbers: {error}") from error
+            if values.ndim != 2 or values.shape[1] != columns or len(values) != len(self.points):
+                raise RegistrationError(
+                    f"{name} of landmarks have the shape {values.shape}: give points (k, 3) in metres and as many "
+                    "pixels (k, 2)"
+                )
+            object.__setattr__(self, name, values)
+        if self.frames is not None:
+            object.__setattr__(self, "frames", np.asarray(self.frames, dtype=np.int64))
 
 
 def load_landmarks(path: Path) -> Landmarks:
@@ -44,14 +63,8 @@ def load_landmarks(path: Path) -> Landmarks:
     Raises RegistrationError if the file is missing, has another header, or a value is no number, or one that cannot be
     meant.
     """
-    lines = read_text(path, "landmarks", RegistrationError).splitlines()
-    rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    if len(header) == 1 and ";" in header[0]:
-        raise RegistrationError(
-            f"{path}: its columns are separated by semicolons: separate them by commas, and write numbers with decimal "
-            "points"
-        )
+    rows = [cells for _, cells in read_csv(path, "landmarks", RegistrationError)]
+    header = tuple(rows[0]) if rows else ()
     if header not in (HEADER, (FRAME, *HEADER)):
         raise RegistrationError(
             f"{path}: the first line of a landmark file is {','.join(HEADER)}, with {FRAME} before it in a map"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from morph_dslam.errors import MorphError
+
+_SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 
 def read_text(path: Path, what: str, error_class: type[MorphError]) -> str:
@@ -24,6 +27,28 @@ def read_text(path: Path, what: str, error_class: type[MorphError]) -> str:
         raise error_class(f"cannot read the {what} {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise error_class(f"{path} is not a text file, so no {what}: {error}") from error
+
+
+def read_csv(path: Path, what: str, error_class: type[MorphError]) -> list[tuple[int, list[str]]]:
+    """Number and cells, without spaces around them, of each line of a CSV file that holds any.
+
+    Parameters as of `read_text`.
+
+    Raises
+    ------
+    error_class
+        If the file cannot be read, or something else than commas separates its cells.
+    """
+    reader = csv.reader(read_text(path, what, error_class).splitlines())
+    try:
+        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise error_class(f"{path}, line {reader.line_num} is no line of a CSV file: {error}") from error
+    rows = [(line, cells) for line, cells in rows if any(cells)]
+    for separator, name in _SEPARATORS.items():
+        if rows and separator in rows[0][1][0]:
+            raise error_class(f"{path} is separated by {name}: write commas between cells, and decimals with points")
+    return rows
 
 
 def read_toml(path: Path, what: str, error_class: type[MorphError]) -> dict[str, Any]:

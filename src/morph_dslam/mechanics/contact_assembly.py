@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.contact import Contact, RigidObstacle, SurfaceContact
+from morph_dslam.mechanics.contact import Contact, RigidObstacle, RigidPlane, SurfaceContact
 from morph_dslam.mechanics.contact_search import Crossings, find_crossings, local_geometry
 from morph_dslam.mechanics.contact_surface import ContactSurface
 from morph_dslam.mechanics.kinematics import Shape
@@ -181,8 +181,14 @@ class ContactAssembly:
                 where = ", ".join(f"{1e3 * x:.4g}" for x in entered.place[int(np.argmin(entered.gap))])
                 raise StudyError(
                     f"the {contact.name} reaches {1e3 * depth:.3g} mm into the undeformed surface '{contact.on}', "
-                    f"deepest at ({where}) mm: move it away, or let a parameter push it in"
+                    f"deepest at ({where}) mm: {self._advice(contact)}"
                 )
+
+    def _advice(self, contact: Contact) -> str:
+        """What to do about an obstacle that overlaps the undeformed solid."""
+        if isinstance(contact, RigidPlane) and (contact.touch(self._symbols, self._mesh.nodes).gap < 0.0).all():
+            return "all of the solid lies behind it, so turn its normal round, towards the solid"
+        return "move it away, or let a parameter push it in"
 
     def _entered(self, x: Array) -> list[list[_Entered]]:
         """For each contact, the points that have entered something at ``x`` (3 n,) and the present parameters."""

@@ -28,8 +28,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.mechanics.spaces import DisplacementSpace
-from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.model.cell_types import cell_type
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -45,6 +45,25 @@ class DeadTraction:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceForce:
+    """Force spread evenly over a surface of the mesh that keeps its direction.
+
+    Attributes
+    ----------
+    on : surface.
+    force : total, N, whatever the shape parameters.
+    """
+
+    on: str
+    force: Vector
+    bonus_order = 0
+
+    def energy(self, kinematics: Kinematics, area: float) -> Any:
+        """Energy per area of NGSolve's mesh, up to a constant; ``area`` is that of the surface there, m2."""
+        return -ngs.CF(self.force) * kinematics.displacement / area
+
+
+@dataclass(frozen=True, eq=False)
 class FollowerPressure:
     """Pressure on the deformed surface, against its outward normal: t = -p n.
 
@@ -192,7 +211,17 @@ class MovingLine:
         return -density * (ngs.CF(self.force) * kinematics.displacement) * kinematics.area_ratio
 
 
-Load = DeadTraction | EdgeLoad | MovingPatch | MovingLine | FollowerPressure | BodyForce | Gravity | PointLoad
+Load = (
+    DeadTraction
+    | SurfaceForce
+    | EdgeLoad
+    | MovingPatch
+    | MovingLine
+    | FollowerPressure
+    | BodyForce
+    | Gravity
+    | PointLoad
+)
 
 
 def _check_width(on: str, width: float) -> None:

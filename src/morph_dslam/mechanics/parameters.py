@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.model import Parameter
+from morph_dslam.model.reduced_model import state_text
 
 Array = NDArray[np.float64]
 #: A number, or an expression of parameter symbols.
@@ -49,6 +50,10 @@ class ParameterSymbols:
     def default(self) -> Array:
         """Values (d,) of the state that nothing is known about, SI."""
         return np.array([p.default for p in self.parameters])
+
+    def text(self, mu: Array) -> str:
+        """A state (d,), SI, for messages: "load = 0.015 N, modulus = 3 MPa"."""
+        return state_text(self.parameters, mu)
 
     def set(self, mu: Array) -> None:
         """Make ``mu`` (d,), SI, the present values."""

@@ -22,7 +22,7 @@ from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.kinematics import Kinematics
 from morph_dslam.mechanics.materials.base import VOIGT
 from morph_dslam.mechanics.ngsolve_mesh import corner_monomials, reference_points
-from morph_dslam.meshing.cell_types import CellType
+from morph_dslam.model.cell_types import CellType
 from morph_dslam.model.reduced_model import von_mises
 
 if TYPE_CHECKING:

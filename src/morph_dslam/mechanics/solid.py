@@ -27,7 +27,7 @@ from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.enhanced_strain import EnhancedStrain, takes_enhanced_strain
 from morph_dslam.mechanics.kinematics import Kinematics, Shape, ShapeField
 from morph_dslam.mechanics.load_modes import LoadedSurface
-from morph_dslam.mechanics.loads import BodyForce, FollowerPressure, Gravity, Load, NodalForces, PointLoad
+from morph_dslam.mechanics.loads import BodyForce, FollowerPressure, Gravity, Load, NodalForces, PointLoad, SurfaceForce
 from morph_dslam.mechanics.materials.base import Material, isotropic_average
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
@@ -239,6 +239,9 @@ class SolidProblem:
         if isinstance(load, FollowerPressure):
             work = load.virtual_work(kinematics, test)
             return [Term(work, boundary, load.bonus_order, has_energy=False)]
+        if isinstance(load, SurfaceForce):
+            area = ngs.Integrate(ngs.CF(1.0) * ngs.ds(definedon=boundary), self.geometry.ngs)
+            return [Term(load.energy(kinematics, area), boundary, load.bonus_order)]
         return [Term(load.energy(kinematics), boundary, load.bonus_order)]
 
     def _free_dofs(self) -> NDArray[np.bool_]:
@@ -260,6 +263,10 @@ class SolidProblem:
     def initial_state(self) -> State:
         """The undeformed solid at the parameters' defaults: where every path starts."""
         return State(self.symbols.default, np.zeros(self.n_dofs))
+
+    def state_text(self, mu: Array) -> str:
+        """A state (d,) for messages."""
+        return self.symbols.text(mu)
 
     def prescribed(self, mu: Array) -> Array:
         self.symbols.set(mu)

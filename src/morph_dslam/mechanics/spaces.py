@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh, reference_points
-from morph_dslam.meshing.cell_types import CellType, cell_type
 from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.model.cell_types import CellType, cell_type
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.cell_types import cell_type
-from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces
 from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
+from morph_dslam.model.cell_types import cell_type
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -60,13 +60,12 @@ def with_surfaces(mesh: Mesh, surfaces: dict[str, Indices]) -> Mesh:
     return replace(mesh, node_sets={name: mesh.surface_nodes(name) for name in mesh.surfaces})
 
 
-def _plane_surfaces(grid: Mesh, planes: dict[str, tuple[int, int]], rest: str = "") -> dict[str, Indices]:
+def _plane_surfaces(grid: Mesh, planes: dict[str, tuple[int, int]], rest: str) -> dict[str, Indices]:
     """Boundary faces of a grid in coordinate planes, given as name: (axis, value); all others by the name ``rest``."""
     faces = grid.boundary_faces()
     points = grid.nodes[grid.face_nodes(faces, corners_only=True)[:, :3]]
     on = {name: (points[:, :, axis] == value).all(axis=1) for name, (axis, value) in planes.items()}
-    if rest:
-        on[rest] = ~np.any(list(on.values()), axis=0)
+    on[rest] = ~np.any(list(on.values()), axis=0)
     return {name: faces[mask] for name, mask in on.items()}
 
 
@@ -303,10 +302,8 @@ def block(size: tuple[float, float, float], divisions: tuple[int, int, int], cel
     if len(size) != 3 or min(size) <= 0.0:
         raise StudyError(f"the block's size is {tuple(size)} m; give three positive lengths")
     grid = _unit_grid(np.ones(divisions, dtype=bool), cell_type)
-    names = {f"{axis}_min": (i, 0) for i, axis in enumerate("xyz")}
-    names |= {f"{axis}_max": (i, divisions[i]) for i, axis in enumerate("xyz")}
     mesh = replace(grid, nodes=grid.nodes * (np.array(size) / np.array(divisions)))
-    return with_surfaces(mesh, _plane_surfaces(grid, names))
+    return with_surfaces(mesh, end_surfaces(mesh))
 
 
 def tube(

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
-from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
 from morph_dslam.meshing.netgen_meshing import (
@@ -27,6 +26,7 @@ from morph_dslam.meshing.netgen_meshing import (
     mesh_surface_file,
     read_surface,
 )
+from morph_dslam.model.cell_types import cell_type
 from morph_dslam.units import to_si
 
 Indices = NDArray[np.int64]
@@ -207,6 +207,11 @@ def _read(path: Path) -> Any:
 
 
 def _damaged(path: Path, error: Exception) -> StudyError:
+    if file_kind(path) == ".msh" and path.read_bytes()[:1] == b"(":
+        return StudyError(
+            f"{path} is an ANSYS mesh file, which ends in .msh too: save it as Gmsh's, from meshio with "
+            'file_format="gmsh" or "gmsh22"'
+        )
     return StudyError(f"{path} is damaged, cut short, or no {file_kind(path)} file ({type(error).__name__}: {error})")
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from morph_dslam.meshing.cell_types import CellType
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, jacobian_determinants
+from morph_dslam.model.cell_types import CellType
 
 
 def _with_faces_found_again(mesh: Mesh, old: Mesh) -> Mesh:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.cell_types import CellType, cell_type
+from morph_dslam.model.cell_types import CellType, cell_type
 from morph_dslam.studies.problem import ModelMesh
 
 Array = NDArray[np.float64]
@@ -22,6 +23,11 @@ _FACE_TRIANGLES: dict[int, tuple[tuple[int, int, int], ...]] = {
     8: ((0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), (4, 5, 7), (5, 6, 7)),
     9: ((0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), (4, 5, 8), (5, 6, 8), (6, 7, 8), (7, 4, 8)),
 }
+
+
+def natural_order(name: str) -> list[str | int]:
+    """A key that sorts "face_2" before "face_10"."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,22 @@ class Mesh:
         """Faces (f, 2) of a surface. Raises StudyError if there is none of this name."""
         return self._named(self.surfaces, name, "surface")
 
+    def faces_in(self, name: str) -> Indices:
+        """Faces (f, 2) of the surface, or else the outer ones that have all nodes in the node set, of this name.
+
+        Raises StudyError if there is neither, or the node set holds no whole face.
+        """
+        if name in self.surfaces or name not in self.node_sets:
+            return self._named(self.surfaces, name, "surface", self.node_sets)
+        outer = self.boundary_faces()
+        nodes = self.face_nodes(outer)
+        found = outer[(np.isin(nodes, self.node_sets[name]) | (nodes < 0)).all(axis=1)]
+        if not len(found):
+            raise StudyError(
+                f"'{name}' is a node set that holds no whole face of the mesh: name a surface, or all nodes of a face"
+            )
+        return found
+
     def surface_nodes(self, name: str) -> Indices:
         """Sorted nodes of a surface, the middle nodes of its faces included; raises as `surface` does."""
         nodes = np.unique(self.face_nodes(self.surface(name)))
@@ -97,7 +119,7 @@ class Mesh:
 
     def _named(self, sets: Mapping[str, Indices], name: str, what: str, more: Mapping = {}) -> Indices:
         if name not in sets:
-            known = ", ".join(sorted({*sets, *more})) or "none"
+            known = ", ".join(sorted({*sets, *more}, key=natural_order)) or "none"
             raise StudyError(f"the mesh has no {what} '{name}'; it has: {known}")
         return sets[name]
 

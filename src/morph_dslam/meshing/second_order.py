@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.cell_types import cell_type
 from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.model.cell_types import cell_type
 
 Indices = NDArray[np.int64]
 #: Second-order types by the first-order type that they refine.

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.errors import ParameterError
+from morph_dslam.errors import ParameterError, StudyError
 from morph_dslam.model.separated import Outside, SeparatedField
 from morph_dslam.model.unknown_loads import ElasticEnergy, UnknownLoads
-from morph_dslam.units import from_si
+from morph_dslam.units import from_si, read_quantity
 
 Array = NDArray[np.float64]
-#: Values of the parameters in SI: all of them in order (d,), or some by name; the others have their defaults.
-ParameterValues = ArrayLike | Mapping[str, float]
+#: Values of the parameters: all of them in order (d,), SI, or some by name, SI or texts such as "20 mN"; the others
+#: have their defaults.
+ParameterValues = ArrayLike | Mapping[str, float | str]
+#: Values may pass the end of a range by so much of its width: tables round.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,26 @@ class Parameter:
     def display(self, value: float) -> float:
         """``value`` (SI) in ``unit``."""
         return from_si(value, self.unit, self.quantity)
+
+    def text(self, value: float) -> str:
+        """``value`` (SI) for people, with its unit."""
+        return f"{self.display(value):.6g} {self.unit}".removesuffix(" 1")
+
+    @property
+    def range_text(self) -> str:
+        """The range for people, "0 to 20 mm"."""
+        return f"{self.display(self.lower):.6g} to {self.text(self.upper)}"
+
+    def in_range(self, value: float) -> bool:
+        """Whether ``value`` (SI) lies in the range, but for rounding; NaN does not."""
+        slack = ROUNDING * (self.upper - self.lower)
+        return self.lower - slack <= value <= self.upper + slack
+
+
+def state_text(parameters: Sequence[Parameter], mu: ArrayLike) -> str:
+    """A state (d,), SI, for people: "load = 0.015 N, modulus = 3 MPa"."""
+    values = np.atleast_1d(np.asarray(mu, dtype=np.float64))
+    return ", ".join(f"{p.name} = {p.text(value)}" for p, value in zip(parameters, values, strict=True))
 
 
 @dataclass(frozen=True)
@@ -106,6 +129,9 @@ def equivalent_strain(strain: Array) -> Array:
 REACTION, FORCE, MOMENT = "reaction_", "force_", "moment_"
 
 
+Points = SurfacePoints | MaterialPoints
+
+
 @dataclass(frozen=True)
 class ReducedModel:
     """What a `.morph` file holds.
@@ -147,6 +173,11 @@ class ReducedModel:
     certificate: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        ranges = ", ".join(f"{p.name} {p.range_text}" for p in self.study_parameters) or "rigid"
+        loads = f", {self.n_loads} unknown loads" if self.n_loads else ""
+        return f"<ReducedModel '{self.name}': {len(self.nodes)} nodes, {ranges}{loads}>"
+
     @property
     def n_loads(self) -> int:
         """How many of the last parameters are coefficients of unknown loads."""
@@ -183,7 +214,7 @@ class ReducedModel:
         Raises
         ------
         ParameterError
-            If a name is not one of the model's parameters, or an array has another length.
+            If a name is not one of the model's parameters, a text is no value of one, or an array has another length.
         """
         names = [p.name for p in self.parameters]
         if isinstance(parameters, Mapping):
@@ -191,8 +222,13 @@ class ReducedModel:
                 raise ParameterError(
                     f"the model '{self.name}' has no parameter '{unknown[0]}'; it has {', '.join(names) or 'none'}"
                 )
-            return np.array([parameters.get(p.name, p.default) for p in self.parameters], dtype=np.float64)
-        mu = np.asarray(parameters, dtype=np.float64)
+            return np.array([_si(p, parameters.get(p.name, p.default)) for p in self.parameters], dtype=np.float64)
+        try:
+            mu = np.asarray(parameters, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ParameterError(
+                f"{parameters!r} is neither an array of parameters nor a table of them by name"
+            ) from None
         if mu.shape != (len(names),):
             raise ParameterError(
                 f"the model '{self.name}' has {len(names)} parameters ({', '.join(names)}), "
@@ -200,9 +236,56 @@ class ReducedModel:
             )
         return mu
 
-    def at(self, parameters: ParameterValues, outside: Outside = "bounded") -> DeformedState:
-        """The object at some parameters: its displacement, strain, stress and reactions."""
-        return DeformedState(self, self.vector(parameters), outside)
+    def at(self, parameters: ParameterValues, outside: Outside | None = None) -> DeformedState:
+        """The object at some parameters: its displacement, strain, stress and reactions.
+
+        Parameters
+        ----------
+        parameters : values by name, SI or texts with a unit such as "20 mN", the others at their defaults; or all in
+            order (d,), SI.
+        outside : what fields are where a parameter is outside of its range (`SeparatedField`): "bounded", those of the
+            nearest state in it, or "linear", continued by tangents; by default it is refused.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such parameter, or a value is not finite, not readable, or outside of its range.
+        """
+        mu = self.vector(parameters)
+        for p, value in zip(self.parameters, mu, strict=True):
+            if not np.isfinite(value):
+                raise ParameterError(f"{p.name} = {value} is not a finite number")
+        if outside is None:
+            # A periodic parameter is in its range whatever its value.
+            for p, value, inside in zip(self.parameters, mu, self.displacement.inside(mu), strict=True):
+                if not inside and not p.in_range(value):
+                    raise ParameterError(
+                        f"{p.name} = {p.text(value)} is outside of its range, {p.range_text} (numbers are SI); "
+                        'outside="bounded" takes the nearest state in it'
+                    )
+        return DeformedState(self, mu, outside or "bounded")
+
+    def points(self, positions: ArrayLike, reach: float = 0.0) -> MaterialPoints:
+        """Points of the object, inside or on its surface, by their positions in the undeformed shape.
+
+        Parameters
+        ----------
+        positions : (p, 3), or (3,) for one point, object frame, metres.
+        reach : points outside by at most about this, metres, are drawn to the object. The faces of the mesh are not
+            quite those of a curved object.
+
+        Raises
+        ------
+        ParameterError
+            If a point lies farther outside of the solid, or off the surface of a sheet.
+        """
+        # SciPy takes as long to load as all else that a model needs.
+        from morph_dslam.model.point_location import material_points
+
+        places = np.atleast_2d(np.asarray(positions, dtype=np.float64))
+        if places.ndim != 2 or places.shape[1] != 3 or not np.isfinite(places).all():
+            raise ParameterError(f"points are finite positions (p, 3) in metres, not an array of shape {places.shape}")
+        return material_points(self.nodes, self.cells or {"tri3": self.triangles}, places, reach)
 
     def spread_parameters(self, count: int) -> Array:
         """The default and ``count`` samples spread evenly over the box (1 + count, d); without parameters the default.
@@ -251,35 +334,49 @@ class ReducedModel:
         place : a key of `stresses`; the largest at each node of all places if absent.
         outside : what the field is outside the parameter box.
         """
-        places = list(self.stresses) if place is None else [place]
-        if not places or not self.stresses.keys() >= set(places):
-            raise ParameterError(f"the model '{self.name}' has no stress {place or ''}")
-        mu = self.vector(parameters)
-        return np.max([von_mises(self.stresses[key].value(mu, outside)) for key in places], axis=0)
+        return DeformedState(self, self.vector(parameters), outside).von_mises(place)
 
-    def _interpolation(self, points: SurfacePoints | MaterialPoints) -> tuple[NDArray[np.int64], Array]:
+    def _interpolation(self, points: Points) -> tuple[NDArray[np.int64], Array]:
         if isinstance(points, SurfacePoints):
             return self.triangles[points.triangles], points.weights
         return points.corners, points.weights
 
-    def rest_positions(self, points: SurfacePoints | MaterialPoints) -> Array:
+    def rest_positions(self, points: Points) -> Array:
         """Undeformed positions (p, 3) of points, metres."""
         corners, weights = self._interpolation(points)
         return np.einsum("pc,pcx->px", weights, self.nodes[corners])
 
     def restrict(
-        self,
-        points: SurfacePoints | MaterialPoints,
-        name: str = "displacement",
-        precision: type[np.floating] = np.float64,
+        self, points: Points, name: str = "displacement", precision: type[np.floating] = np.float64
     ) -> SeparatedField:
-        """The field called ``name`` in `fields` at these points only, its modes in this precision."""
-        return self.fields[name].restrict(*self._interpolation(points), precision)
+        """The field called ``name`` in `fields` at these points only, its modes in this precision.
+
+        Raises
+        ------
+        ParameterError
+            If the model has no such field.
+        """
+        return self.field(name).restrict(*self._interpolation(points), precision)
+
+    def field(self, name: str) -> SeparatedField:
+        """The field called ``name`` in `fields`.
+
+        Raises
+        ------
+        ParameterError
+            If the model has none of this name.
+        """
+        fields = self.fields
+        if name not in fields:
+            raise ParameterError(f"the model '{self.name}' has no field '{name}'; it has {', '.join(fields)}")
+        return fields[name]
 
 
 @dataclass(frozen=True)
 class DeformedState:
-    """A reduced model at given parameters; fields at the mesh's nodes, object frame.
+    """A reduced model at given parameters; object frame.
+
+    Fields are given at the mesh's nodes, or at points of `ReducedModel.points`: n is the number of either.
 
     Attributes
     ----------
@@ -292,43 +389,72 @@ class DeformedState:
     parameters: Array
     outside: Outside = "bounded"
 
-    def displacement(self) -> Array:
+    def displacement(self, points: Points | None = None) -> Array:
         """(n, 3), metres."""
-        return self.model.displacement.value(self.parameters, self.outside)
+        return self._value("displacement", points)
 
-    def positions(self) -> Array:
-        """Deformed nodes (n, 3), metres."""
-        return self.model.positions(self.parameters, self.outside)
+    def positions(self, points: Points | None = None) -> Array:
+        """Where the nodes or points are (n, 3), metres."""
+        rest = self.model.nodes if points is None else self.model.rest_positions(points)
+        return rest + self.displacement(points)
 
-    def strain(self) -> Array:
+    def strain(self, points: Points | None = None) -> Array:
         """Green-Lagrange strain (n, 6) of a solid: xx, yy, zz, yz, xz, xy."""
-        return self._field("strain", self.model.strain)
+        return self._value("strain", points)
 
-    def stress(self, place: str | None = None) -> Array:
+    def stress(self, place: str | None = None, points: Points | None = None) -> Array:
         """Stress (n, 6) of a solid or (n, 3) on a face of a sheet, pascals (`ReducedModel.stresses`).
 
         Parameters
         ----------
-        place : a key of `ReducedModel.stresses`; the first of them if absent.
+        place : "solid" for solids, "top" or "bottom" for sheets; the first of `ReducedModel.stresses` if absent.
+        points : at which; all nodes if absent.
         """
-        stresses = self.model.stresses
-        return self._field(f"stress_{place or ''}", stresses.get(place or next(iter(stresses), "")))
+        return self._value(f"stress_{self._places(place)[0]}", points)
 
-    def von_mises(self, place: str | None = None) -> Array:
-        """Von Mises stress (n,), pascals; the largest at each node of all places if none is named."""
-        return self.model.von_mises(self.parameters, place, self.outside)
+    def von_mises(self, place: str | None = None, points: Points | None = None) -> Array:
+        """Von Mises stress (n,), pascals; the largest of all places if none is named (`ReducedModel.von_mises`)."""
+        return np.max([von_mises(self.stress(key, points)) for key in self._places(place)], axis=0)
+
+    def derivatives(self, name: str = "displacement", points: Points | None = None) -> Array:
+        """Derivatives (d, n, k) of a field with k components by each parameter, SI.
+
+        Parameters
+        ----------
+        name : a key of `ReducedModel.fields`: "displacement", "strain", "stress_solid" and so on.
+        points : at which; all nodes if absent.
+        """
+        return self._field(name, points).value_and_sensitivities(self.parameters, self.outside)[1]
 
     def reactions(self) -> dict[str, Array]:
         """What supports exert (3,): "force_SET" in newtons and "moment_SET" in newton metres."""
         fields = self.model.reactions
         return {name: field.value(self.parameters, self.outside)[0] for name, field in fields.items()}
 
-    def _field(self, name: str, field: SeparatedField | None) -> Array:
-        if field is None:
-            raise ParameterError(
-                f"the model '{self.model.name}' has no field '{name}'; it has {', '.join(self.model.fields)}"
-            )
-        return field.value(self.parameters, self.outside)
+    def _places(self, place: str | None) -> list[str]:
+        """The places of the stress that are asked for; ParameterError if the model has none, or not this one."""
+        places = list(self.model.stresses)
+        if not places:
+            raise ParameterError(f"the model '{self.model.name}' has no stress; it has {', '.join(self.model.fields)}")
+        if place is not None and place not in places:
+            raise ParameterError(f"the model '{self.model.name}' has no stress '{place}'; it has {', '.join(places)}")
+        return places if place is None else [place]
+
+    def _field(self, name: str, points: Points | None) -> SeparatedField:
+        return self.model.field(name) if points is None else self.model.restrict(points, name)
+
+    def _value(self, name: str, points: Points | None) -> Array:
+        return self._field(name, points).value(self.parameters, self.outside)
+
+
+def _si(parameter: Parameter, value: float | str) -> float:
+    """A value given by name, as a number in SI or as a text with its unit."""
+    try:
+        return read_quantity(value, parameter.quantity) if isinstance(value, str) else float(value)
+    except StudyError as error:
+        raise ParameterError(f"{parameter.name}: {error}") from None
+    except (TypeError, ValueError):
+        raise ParameterError(f"{parameter.name} = {value!r} is not a number") from None
 
 
 def triangle_normals(nodes: Array, triangles: NDArray[np.int64]) -> Array:

@@ -142,8 +142,8 @@ def shown_field(model: ReducedModel, show: Shown | None) -> Shown:
     }
     if show is None:
         return "stress" if has["stress"] else "displacement"
-    if not has[show]:
-        held = ", ".join(name for name, held in has.items() if held)
+    if not has.get(show, False):
+        held = ", ".join(name for name, is_held in has.items() if is_held)
         raise ParameterError(f"the model '{model.name}' holds no {show} to show (--show); it has: {held}")
     return show
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict
+from os import PathLike
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -16,7 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import ModelFileError
+from morph_dslam.errors import ModelFileError, check_kind
 from morph_dslam.io.checksum import begins_with, check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
@@ -99,11 +100,20 @@ _PLAIN = " !#$&'()*+,:;=?@[]"
 def save_model(path: str | Path, model: ReducedModel) -> None:
     """Write a model file; the file appears under its name only when it is complete.
 
+    Parameters
+    ----------
+    path : of the file.
+    model : to be written.
+
     Raises
     ------
+    ArgumentError
+        If the arguments are not a path and a model, in this order.
     ValueError
         If the parts of the model do not fit together: such a file could not be read again.
     """
+    check_kind(path, (str, PathLike), "the first argument of save_model", "the path, and the model as the second")
+    check_kind(model, ReducedModel, "the second argument of save_model", "the model, and its path as the first")
     check_model(model)
     path = Path(path)
     with written_with_checksum(path, FORMAT) as file:
@@ -253,11 +263,18 @@ def _open_and_read(path: Path) -> ReducedModel:
 def load_model(path: str | Path) -> ReducedModel:
     """Read and check a model file.
 
+    Parameters
+    ----------
+    path : of the file.
+
     Raises
     ------
+    ArgumentError
+        If it is no path.
     ModelFileError
         If the file is missing, cut short, damaged, not a model, or of another version.
     """
+    check_kind(path, (str, PathLike), "the model file", "its path")
     path = Path(path)
     if not path.is_file():
         raise ModelFileError(f"there is no model file {path}; `morph build study.toml -o {path.name}` makes one")

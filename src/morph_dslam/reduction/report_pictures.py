@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.evaluation.report import Picture
+from morph_dslam.io.text import read_csv
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.render.model_view import draw_shapes
 
@@ -218,12 +218,11 @@ def read_reference_curve(path: Path) -> ReferenceCurve:
     if not path.is_file():
         raise StudyError(f"there is no reference curve {path}: it needs {form}")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            (_, label), *rows = [row for row in csv.reader(file) if row]
+        (_, label), *rows = [cells for _, cells in read_csv(path, "reference curve", StudyError)]
         values = np.array(rows, dtype=np.float64)
         modes, errors = values.T
     except ValueError as error:
         raise StudyError(f"{path} is no reference curve ({error}): it needs {form}") from error
     if not (np.isfinite(values).all() and (values > 0.0).all()):
         raise StudyError(f"{path}: numbers of modes and errors must be positive")
-    return ReferenceCurve(label.strip(), modes, errors)
+    return ReferenceCurve(label, modes, errors)

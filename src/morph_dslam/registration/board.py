@@ -88,6 +88,8 @@ FEWEST_CORNERS = 4
 DOTS_PER_INCH = 300
 #: A side of a print is at most so long, metres: beyond it the unit was mistaken.
 LARGEST_SIDE = 10.0
+#: Smaller markers were meant in another unit.
+LEAST_MARKER_MM = 1.0
 
 
 class Place(Section):
@@ -126,6 +128,8 @@ class BoardFile(Section):
             raise ValueError("a charuco board needs square_mm, larger than marker_mm")
         if self.kind == "charuco" and min(self.columns, self.rows) < 3:
             raise ValueError("a charuco board needs 3 x 3 squares at least")
+        if self.marker_mm < LEAST_MARKER_MM:
+            raise ValueError(f"markers of {self.marker_mm:g} mm cannot be seen; sizes are in millimetres, not metres")
         other = "square_mm" if self.kind == "grid" else "gap_mm"
         if getattr(self, other) is not None:
             raise ValueError(f"{other} is for the other kind of board: leave it out of a {self.kind}")
@@ -209,9 +213,25 @@ class FiducialBoard:
         return {"opencv": [points], "apriltag": [turned], None: [points, turned]}[self.description.tag_corners]
 
     def image(self, pixels_per_metre: float) -> NDArray[np.uint8]:
-        """The print (h, w) without a margin, 0 black."""
-        width, height = (max(1, round(side * pixels_per_metre)) for side in self.size)
-        return np.asarray(self._board.generateImage((width, height), marginSize=0), dtype=np.uint8)
+        """The print (h, w) without a margin, 0 black: each pixel shows what is at its centre."""
+        d, board, aruco = self.description, self._board, cv2.aruco  # type: ignore[attr-defined]
+        counts = [max(1, round(side * pixels_per_metre)) for side in self.size]
+        x, y = ((np.arange(n) + 0.5) * side / n for n, side in zip(counts, self.size, strict=True))
+        image = np.full((len(y), len(x)), 255, dtype=np.uint8)
+        if d.kind == "charuco":
+            across, down = ((at // self.pitch % 2).astype(np.uint8) for at in (x, y))
+            image = 255 * (down[:, None] ^ across)
+        # OpenCV's own picture has markers of whole pixels a cell, at rounded places, and none of some sizes.
+        dictionary = board.getDictionary()
+        cells = dictionary.markerSize + 2
+        for corners, number in zip(board.getObjPoints(), np.ravel(board.getIds()).tolist(), strict=True):
+            left, top = np.asarray(corners, dtype=float)[0, :2]
+            scale = 1e3 * cells / d.marker_mm
+            columns, rows = (np.floor(scale * (at - first)).astype(int) for at, first in ((x, left), (y, top)))
+            across, down = ((k >= 0) & (k < cells) for k in (columns, rows))
+            bits = aruco.generateImageMarker(dictionary, number, cells)
+            image[np.ix_(down, across)] = bits[np.ix_(rows[down], columns[across])]
+        return image
 
 
 def load_board(path: Path) -> FiducialBoard:

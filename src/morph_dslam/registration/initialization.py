@@ -15,6 +15,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
+from morph_dslam.tracking.option_values import FileOptions
 
 Image = NDArray[np.uint8]
 #: A coordinate or an angle. None is meant by what is larger: in millimetres it would be ten kilometres.
@@ -31,7 +32,7 @@ class Initializer(Protocol):
 
 
 @dataclass(frozen=True)
-class InitializerFiles:
+class InitializerFiles(FileOptions):
     """Files of which at most one is given (docs/registration-aids.md).
 
     Attributes
@@ -70,6 +71,7 @@ def register_by_initializer(
 
 def undistorted_grey(camera: Camera, image: Image) -> Image:
     """The grey image (h, w) without distortion of a frame (h, w, 3) or (h, w) as recorded."""
+    image = camera.checked_picture(image, "the image")
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     maps = camera.undistortion_maps()
     return grey if maps is None else np.asarray(cv2.remap(grey, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)

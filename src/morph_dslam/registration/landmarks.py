@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.errors import RegistrationError, RegistrationFailure, check_kind
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, SurfacePoints
@@ -38,6 +38,7 @@ from morph_dslam.registration.messages import (
 from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
+from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
 from morph_dslam.tracking.refinement import refine_by_depth
@@ -98,7 +99,20 @@ def register_landmarks(
     RegistrationError
         If there are fewer than 4 landmarks, one lies off the object or outside the image, or no pose and
         parameters explain them.
+    ArgumentError
+        If model, camera or landmarks are of another kind.
+    CameraError
+        If image or depth is not of the camera's size, or of another type.
     """
+    check_kind(model, ReducedModel, "model", "the model that load_model reads from the file")
+    check_kind(camera, Camera, "camera", "the camera that load_camera reads from the file, or Camera(...)")
+    check_kind(
+        landmarks,
+        (Landmarks, str, Path),
+        "landmarks",
+        "Landmarks(points, pixels) of morph_dslam.extend.registration, or the path of a file that has them",
+    )
+    announce_compilation()
     if not isinstance(landmarks, Landmarks):
         landmarks = load_landmarks(Path(landmarks))
     bound = bind_landmarks(model, landmarks.points)
@@ -130,6 +144,7 @@ def register_landmarks(
     precise = Estimator(model, camera)
     precise.box = estimator.box
     if depth is not None:
+        camera.check_depth(depth, "the depth")
         # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
         sigma = max(best.sigma_px, LEAST_PX) if np.isfinite(best.sigma_px) else UNKNOWN_PX
         best = refine_by_depth(precise, bound, pixels, best.state, sigma, depth, depth_sigma)

@@ -23,6 +23,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.edges import EdgeEvidence
+from morph_dslam.registration.hints import NO_HINTS, Hints
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
 from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
 from morph_dslam.registration.messages import (
@@ -42,14 +43,8 @@ from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, sp
 from morph_dslam.registration.search_space import attitudes, candidate_regions, find_planes
 from morph_dslam.registration.surface_search import laid
 from morph_dslam.registration.texture import FEWEST, Agreement, TextureComparison
-from morph_dslam.registration.view_registration import (
-    NO_HINTS,
-    TELLING_CHANCE,
-    Claimed,
-    EdgeRegistration,
-    EdgeSearch,
-    Hints,
-)
+from morph_dslam.registration.view_registration import TELLING_CHANCE, Claimed, EdgeRegistration, EdgeSearch
+from morph_dslam.sources.recorded import DEPTH_SCALE
 
 Array = NDArray[np.float64]
 #: Sizes at which the surface starts, over that of the region.
@@ -488,11 +483,7 @@ def register_in_unit(
 def _other_size(factor: float, has_depth: bool) -> str:
     """That the object is so many times as large as its mesh in a metric map, by depth images or by a stereo pair."""
     mesh = "the unit of its mesh (--unit of `morph build --rigid`, or that of the mesh in the study)"
-    metre = (
-        "the scale of the depth images (5000 values a metre in folders of TUM RGB-D, elsewhere often 1000)"
-        if has_depth
-        else "the baseline of the stereo pair"
-    )
+    metre = DEPTH_SCALE if has_depth else "the baseline of the stereo pair"
     is_unit = any(same_size(factor * a / b) for a, b in permutations(UNITS.values(), 2))
     likelier, other = (mesh, metre) if is_unit else (metre, mesh)
     return (

@@ -20,6 +20,7 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
+from morph_dslam.registration.hints import GuessedPose, Hints
 from morph_dslam.registration.landmarks import (
     FEWEST_FOR_FIT,
     HINT_SURFACE_SHARE,
@@ -40,7 +41,6 @@ from morph_dslam.registration.registration import (
     registration_in_map,
 )
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, spread_views
-from morph_dslam.registration.view_registration import GuessedPose, Hints
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
@@ -258,6 +258,7 @@ def run_registration(
     distance: float | None = None,
     region: tuple[int, tuple[float, float, float, float]] | None = None,
     guess: Path | None = None,
+    overwrite: bool = False,
 ) -> Registration:
     """Register an object from files to files: ``registration.json``, and ``registration.jpg`` without a board.
 
@@ -270,18 +271,24 @@ def run_registration(
     beside : files of registrations of other objects in this map, to which the points on them are left.
     board : file of a board that stands in the scene, to register by; by the mesh if None.
     landmarks, distance, region, guess : hints, as of `register`.
+    overwrite : whether to replace a registration that is in the folder.
 
     Raises
     ------
     RegistrationError
         If the object is not found, a file of ``beside`` is not one of this map, or the folder cannot be
-        written.
+        written, or holds a registration that is not to be replaced.
     MapError, ModelFileError, CameraError
         If an input cannot be read.
     """
     hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region, "guess": guess}
     if board is not None and (beside or any(hint is not None for hint in hints.values())):
         raise RegistrationError("a board says where the object is: leave out --beside and the hints")
+    if (output / "registration.json").exists() and not overwrite:
+        raise RegistrationError(
+            f"{output} holds a registration already: choose another folder, or allow it to be overwritten "
+            "(`--overwrite`)"
+        )
     camera, model = load_camera(camera_path), load_model(model_path)
     others = [_load_beside(path, map_path) for path in beside]
     scene = load_scene(map_path, camera)
@@ -307,10 +314,13 @@ def registration_line(registration: Registration) -> str:
     """The line that sums up a registration in a map."""
     facts: dict[str, Any] = registration.facts
     agreement = "none" if facts["rms_px"] is None else f"{facts['rms_px']:.3f}"
+    deviations = registration.pose_deviations()
+    stated = "unknown" if deviations is None else f"{1e3 * deviations[0]:.2f}"
+    angle = "unknown" if deviations is None else f"{np.degrees(deviations[1]):.2f}"
     return (
         f"map_units_per_metre={facts['map_units_per_metre']:.6g} score={facts['score']:.0f} "
         f"runner_up={facts['runner_up_score']:.0f} explained={facts['n_explained']} rms_px={agreement} "
-        f"ambiguous={'yes' if registration.ambiguous else 'no'}"
+        f"place_std_mm={stated} angle_std_deg={angle} ambiguous={'yes' if registration.ambiguous else 'no'}"
     )
 
 

@@ -223,10 +223,40 @@ class Registration:
     alternatives: tuple[State, ...] = ()
     rivals: tuple[Rival, ...] = ()
 
+    def __repr__(self) -> str:
+        """One line: what was registered by what, the parameters, and how many warnings there are."""
+        shown = [
+            f"{p.name}={p.display(value):.4g} {p.unit}"
+            for p, value in zip(self.model.parameters, self.state.parameters.tolist(), strict=False)
+        ]
+        facts = [self.model.name, f"by {self.facts.get('from', 'a known state')}", *shown]
+        if self.frame is not None:
+            facts.append(f"in frame {self.frame}")
+        return f"Registration({', '.join(facts)}, {len(self.warnings)} warnings)"
+
     @property
     def ambiguous(self) -> bool:
         """Whether another registration is nearly as good, or the images do not confirm this one."""
         return any(isinstance(warning, Ambiguous | OutlineElsewhere) for warning in self.warnings)
+
+    def pose_deviations(self) -> tuple[float, float] | None:
+        """Standard deviations of the mean node's place, metres, and of the attitude, rad, in the reference frame.
+
+        Each is that of the direction that is known worst. The turn about an axis of revolution does not count. None
+        where they are not known.
+        """
+        pose = self.state.camera_from_object
+        covariance = None if self.covariance is None else self.covariance[-6:, -6:]
+        if self.map_registration is not None:
+            own = [view for view in self.keyframes if view.frame == self.frame and view.covariance is not None]
+            covariance = own[0].covariance if own else self.map_registration.pose_covariance(pose)
+        if covariance is None:
+            return None
+        arm = pose.rotation @ self.model.positions(self.state.parameters).mean(axis=0)
+        of_centre = np.hstack([-cross_matrix(arm), np.eye(3)])
+        worst = (np.linalg.eigvalsh(part)[-1] for part in (of_centre @ covariance @ of_centre.T, covariance[:3, :3]))
+        place, angle = (float(np.sqrt(max(value, 0.0))) for value in worst)
+        return place, angle
 
     @property
     def views(self) -> tuple[KeyframePose, ...]:

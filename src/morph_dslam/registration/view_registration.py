@@ -22,6 +22,7 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.registration.dense_points import DEPTH_NOISE, PointsOnSurface, with_dense_points
 from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, Sighting
+from morph_dslam.registration.hints import NO_HINTS, GuessedPose, Hints
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.mesh_edges import MeshEdges
@@ -61,8 +62,10 @@ N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 30, 4, 8, 8
 #: Edges say nothing where chance puts so much of an outline on some.
 TELLING_CHANCE = 0.5
 #: No other keyframe is searched if a place has such a rank, after the first one and later, and the next place less
-#: than such a part of it. Places as good are fitted again from where each keyframe alone would have them.
+#: than such a part of it. Places as good are fitted again from where each keyframe alone would have them, in so many
+#: rounds at most, while one finds a place that fits so much better.
 ENOUGH, MUCH_WORSE = (0.5, 0.3), 0.5
+MOST_ROUNDS, CLEARLY_BETTER = 3, 1.05
 #: So many keyframes are searched for that, and all until a place has this rank.
 N_SEARCHED, SOMETHING = 3, 0.1
 #: Sizes agree within so many standard deviations, where as much as this part still speaks for the place.
@@ -94,42 +97,6 @@ N_NEAR, NEAR_GUESS_PX, NEAR_GUESS_SIZE, NEAR_GUESS_TURN = 120, 12.0, 0.08, 0.12
 ABOUT_GUESS = (16, 8, 5, 3)
 
 
-@dataclass(frozen=True)
-class GuessedPose:
-    """About where an object is in a frame.
-
-    Attributes
-    ----------
-    frame : its number.
-    camera_from_world : the camera's pose in the map.
-    pose : camera_from_object, metres.
-    """
-
-    frame: int
-    camera_from_world: RigidTransform
-    pose: RigidTransform
-
-
-@dataclass(frozen=True)
-class Hints:
-    """What is known of where the object is in a map, each alone or together.
-
-    Attributes
-    ----------
-    clicks : landmarks in frames whose camera is known.
-    distance : rough distance of the object from the camera in the keyframes, metres.
-    region : number of a keyframe, and left, top, right and bottom of a box around the whole object in it, pixels, with
-        any margin up to half the object's width on each side.
-    guess : about where it is in a frame whose camera is known.
-    """
-
-    clicks: tuple[Sighting, ...] = ()
-    distance: float | None = None
-    region: tuple[int, tuple[float, float, float, float]] | None = None
-    guess: GuessedPose | None = None
-
-
-NO_HINTS = Hints()
 #: Takes points on other objects out of a map, and out of what its views have seen.
 Claimed = Callable[[MapPoints, Sequence[View]], tuple[MapPoints, list[View]]]
 
@@ -155,6 +122,14 @@ class EdgeRegistration:
     def rank(self) -> float:
         """What speaks for it."""
         return _rank(self.edges, self.points)
+
+    @property
+    def fit(self) -> float:
+        """What speaks for it over places near it, where points in one plane count like others.
+
+        Which points of a small object seem to lie in one plane, their noise decides.
+        """
+        return self.edges.total * max(self.points.agreement_of_all, NO_POINTS)
 
 
 def _rank(edges: EdgeEvidence, points: PointEvidence) -> float:
@@ -288,9 +263,17 @@ class EdgeSearch:
             EdgeRegistration(place, covariance, images.evidence(edges, place), self.points_at(place))
             for place, covariance in (by_edges, (in_size, by_both[1]))
         ]
-        return max(fits, key=lambda each: each.rank)
+        return max(fits, key=lambda each: each.fit)
 
     def _again(self, found: EdgeRegistration) -> EdgeRegistration:
+        """The best place near one that was found, by rounds of `_around` while these find clearly better ones."""
+        for _ in range(MOST_ROUNDS):
+            before, found = found.fit, self._around(found)
+            if found.fit < CLEARLY_BETTER * before:
+                break
+        return found
+
+    def _around(self, found: EdgeRegistration) -> EdgeRegistration:
         """The best place near one that was found, of those begun where each keyframe alone has the object."""
         images = self._images(found.place)
 
@@ -303,7 +286,7 @@ class EdgeSearch:
             return self._fitted(start, images, NEAREST)
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
-        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.rank)
+        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.fit)
 
     def _sized(self, found: EdgeRegistration) -> EdgeRegistration:
         """A place with the size by its edges and the points in its outline together, unless they contradict each other.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, TermEstimate
 
 
@@ -24,7 +26,9 @@ def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
     hidden: list[CameraTerm] = [
         term for term, found in estimate.terms.items() if not found.is_observable and term != "readout"
     ]
-    if hidden:
+    if hidden and not any(np.isfinite(estimate.terms[term].departure_std) for term in hidden):
+        yield "this recording cannot check the camera file: too few of its frames share enough points"
+    elif hidden:
         named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in hidden]
         yield f"this recording cannot check the camera file: unobservable here: {'; '.join(named)}"
 

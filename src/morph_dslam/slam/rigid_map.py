@@ -331,9 +331,9 @@ class RigidMap:
         """Numbers of the keyframes that have not been taken out."""
         return np.array([k for k, keyframe in enumerate(self.keyframes) if keyframe.carrier < 0], dtype=int)
 
-    def seen_in_keyframes(self) -> dict[int, Followed]:
-        """What the keyframes see that have not been taken out, by the numbers of their frames."""
-        return {self.keyframes[k].index: self.keyframes[k].seen for k in self.kept_keyframes}
+    def seen_in_keyframes(self, since: int = 0) -> dict[int, Followed]:
+        """What the keyframes from ``since`` on see that have not been taken out, by the numbers of their frames."""
+        return {self.keyframes[k].index: self.keyframes[k].seen for k in self.kept_keyframes if k >= since}
 
     def pose_of(self, number: int) -> Array:
         """camera_from_world (4, 4) of a keyframe; one that was taken out moves along with its carrier."""

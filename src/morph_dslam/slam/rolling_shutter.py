@@ -19,8 +19,8 @@ from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.rigid_map import Followed, RigidMap
 
 Array = NDArray[np.float64]
-#: Frames farther apart say nothing of the velocity in between, seconds.
-MOST_GAP_S = 0.15
+#: Frames farther apart say nothing of the velocity in between, seconds; nor do those whose stamps are rounded to one.
+MOST_GAP_S, LEAST_GAP_S = 0.15, 1e-4
 #: Rounds in which pixels are moved with the poses of the round before.
 ROUNDS = 3
 
@@ -28,7 +28,8 @@ ROUNDS = 3
 def velocities(timestamps: Array, camera_from_world: Array) -> Array:
     """Twists (n, 6) of cameras per second, by the frames before and after each.
 
-    Rotation (rad/s), then translation, from the left: the camera's own axes. NaN where no other frame is near.
+    Rotation (rad/s), then translation, from the left: the camera's own axes. NaN where no other frame is near, or all
+    have one stamp.
 
     Parameters
     ----------
@@ -40,7 +41,7 @@ def velocities(timestamps: Array, camera_from_world: Array) -> Array:
     for k in range(n):
         near = [j for j in (k - 1, k, k + 1) if 0 <= j < n and abs(timestamps[j] - timestamps[k]) < MOST_GAP_S]
         first, last = near[0], near[-1]
-        if first != last:
+        if timestamps[last] - timestamps[first] >= LEAST_GAP_S:
             moved = camera_from_world[last] @ inverse(camera_from_world[first])
             result[k] = twist_of(moved, timestamps[last] - timestamps[first])
     return result
@@ -107,7 +108,7 @@ class RowPoses:
         """Take in the next frame, its pose (4, 4) as of a global shutter, and where it saw map points."""
         gap, before = timestamp - self._time, inverse(self._pose)
         self._twist = np.zeros(6)
-        for _ in range(ROUNDS if 0.0 < gap < MOST_GAP_S and len(seen.ids) >= LEAST_INLIERS else 0):
+        for _ in range(ROUNDS if LEAST_GAP_S <= gap < MOST_GAP_S and len(seen.ids) >= LEAST_INLIERS else 0):
             self._twist = twist_of(pose @ before, gap)
             pose = refined(self._map, self._camera, pose, self._twist, seen)
         self._time, self._pose = timestamp, pose

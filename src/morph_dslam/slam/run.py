@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import MapError
+from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
 from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
 from morph_dslam.io.folders import make_run_folder
@@ -32,6 +32,7 @@ from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camer
 from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, with_terms_of
 from morph_dslam.sources import FrameSource, open_source, open_stream
 from morph_dslam.sources.live import LiveStream
+from morph_dslam.sources.recorded import RecordedFrames
 
 Array = NDArray[np.float64]
 DPI = 110
@@ -52,6 +53,7 @@ def run_slam(
     trajectory: Path | None = None,
     images: Path | None = None,
     refine: Sequence[CameraTerm] = (),
+    depth_per_metre: float | None = None,
     video: bool = True,
     overwrite: bool = False,
     progress: bool = True,
@@ -73,6 +75,7 @@ def run_slam(
     trajectory : file of poses to make the map with instead
     images : recording that the model or the trajectory belongs to; the source by default
     refine : terms of the camera to estimate before; the camera goes into the run folder, ``camera.yaml``
+    depth_per_metre : values a metre of the depth images; as its layout has them by default
     video : draw the video with the points followed
     overwrite : replace a run that is there already
     progress : whether to show a bar
@@ -95,6 +98,10 @@ def run_slam(
     if refine and (map_path is not None or trajectory is not None):
         raise MapError("--refine-camera makes a new map: leave out --map and --trajectory")
     one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last)
+    if depth_per_metre is not None:
+        if not isinstance(stream, RecordedFrames):
+            raise SourceError(f"{source} has no depth images: leave --depth-per-metre out")
+        stream = stream.with_depth_per_metre(depth_per_metre)
     with stream if isinstance(stream, LiveStream) else nullcontext():
         make_run_folder(output, overwrite, "trajectory.txt")
         known: Scene | Trajectory | ColmapModel | None = None
@@ -124,8 +131,14 @@ def run_slam(
                 for frame in track_frames(slam, stream, progress, watch):
                     frames.append(frame)
             again = stream if isinstance(stream, FrameSource) and known is None else None
+        except SourceError as error:
+            if not frames:
+                raise
+            raise SourceError(f"{error}; the {len(frames)} frames before it are in {output}") from error
         finally:
             more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
+            if depth_per_metre is not None:
+                more["inputs"]["depth_per_metre"] = depth_per_metre
             if refined is not None:
                 more["refined_camera"] = {
                     term: found.facts() | {"is_kept": term in kept} for term, found in refined.terms.items()
@@ -140,9 +153,9 @@ def write_run(folder: Path, scene: Scene, more: dict[str, Any]) -> dict[str, Any
     """Write all files but the video; returns the content of ``summary.json``, of which ``more`` is a part."""
     save_trajectory(folder / "trajectory.txt", scene.trajectory)
     meshio.Mesh(scene.points, []).write(folder / "map.ply")
-    scene.save(folder / "map.h5")
     _write_colmap(folder / "colmap", scene)
     _write_csv(folder / "frames.csv", scene)
+    scene.save(folder / "map.h5")
     plots = folder / "plots"
     plots.mkdir(exist_ok=True)
     _plot_trajectory(plots / "trajectory.png", scene)

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError, SourceError
+from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
@@ -29,6 +30,7 @@ from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
+from morph_dslam.slam.run_notes import run_notes
 from morph_dslam.slam.second_pass import find_rest
 from morph_dslam.slam.self_calibration import (
     CHECKED,
@@ -102,10 +104,10 @@ class Scene:
     def camera_estimate(self, terms: Sequence[CameraTerm] = CHECKED) -> CameraEstimate | None:
         """The camera as the recording shows it.
 
-        Where too few frames or points tell of it, all terms are unobservable. None without a path, of a map that was
-        kept as it is, and of a stereo pair.
+        Where too few frames or points tell of it, all terms are unobservable. None without a path, in a map that was
+        known before, and of a stereo pair.
         """
-        if self.slam is None or self.slam.frame_images.is_stereo or not len(self.trajectory):
+        if self.slam is None or self.slam.knows_map or self.slam.frame_images.is_stereo or not len(self.trajectory):
             return None
         key = tuple(terms)
         if key not in self._estimates:
@@ -115,14 +117,31 @@ class Scene:
 
     @property
     def camera_notes(self) -> tuple[str, ...]:
-        """What the recording of the map shows to be wrong with its camera, or does not show."""
+        """What is hardly right with the camera, and what the recording of the map shows of it, or does not show."""
         estimate = self.camera_estimate()
-        return tuple(camera_notes(estimate)) if estimate else self.map.camera_notes
+        notes = tuple(camera_notes(estimate)) if estimate else self.map.camera_notes
+        if self.slam is None:
+            return notes
+        if self.slam.knows_map and not len(self.trajectory):
+            notes = ()  # of another recording, and perhaps of another camera
+        doubts = () if self.slam.frame_images.is_stereo else camera_doubts(self.camera)
+        return tuple(dict.fromkeys((*doubts, *notes)))
+
+    def _median_depth(self) -> float | None:
+        """Of the points in the views that the map keeps, along the optical axis; None without any."""
+        depths = []
+        for keyframe in self.keyframes:
+            points = self.map.positions[self.map.good_of(keyframe.seen).ids]
+            depths.append(points @ keyframe.camera_from_world[2, :3] + keyframe.camera_from_world[2, 3])
+        together = np.concatenate(depths) if depths else np.empty(0)
+        return float(np.median(together)) if len(together) else None
 
     def save(self, path: str | Path) -> None:
         """Write map and path into one file, which `load_scene` and the commands read."""
-        self.map.camera_notes = self.camera_notes
-        save_map(Path(path), self.map, self.camera, self.trajectory)
+        try:
+            self.map.camera_notes = self.camera_notes or self.map.camera_notes
+        finally:  # a check of the camera that fails must not cost the map
+            save_map(Path(path), self.map, self.camera, self.trajectory)
 
     def summary(self) -> dict[str, Any]:
         """Counts, errors and times, as in ``summary.json`` of a run."""
@@ -131,6 +150,7 @@ class Scene:
             "n_keyframes": len(self.keyframes),
             "n_map_points": len(self.map.good),
             "scale": "metres" if self.is_metric else "the median depth of the map's first view is 1",
+            "median_depth_m": self._median_depth() if self.is_metric else None,
         }
         return content | (_summary_of_run(self, self.slam) if self.slam is not None else {})
 
@@ -253,7 +273,8 @@ def trajectory_of(slam: Slam, frames: Sequence[SlamFrame]) -> Trajectory:
 
 def _seen(slam: Slam, frames: Sequence[SlamFrame], path: Trajectory) -> list[Followed]:
     """The map points that the frames of a path saw, keyframes as the map has them: that is more exact."""
-    by_index = {frame.index: frame.points for frame in frames} | slam.map.seen_in_keyframes()
+    # Keyframes of a known map have numbers of another recording.
+    by_index = {frame.index: frame.points for frame in frames} | slam.map.seen_in_keyframes(slam.n_known)
     return [slam.map.good_of(by_index[index]) for index in path.indices.tolist()]
 
 
@@ -351,19 +372,8 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
         "longest_wait_for_mapper_ms": float(np.max(waits)),
         "p99_wait_for_mapper_ms": float(np.percentile(waits, 99)),
         "settings": asdict(slam.options),
-        "flags": [*_flags(scene, slam, after), *scene.camera_notes],
+        "flags": [*run_notes(slam, scene.frames, after), *scene.camera_notes],
     }
-
-
-def _flags(scene: Scene, slam: Slam, after: Sequence[SlamFrame]) -> Iterator[str]:
-    """What a reader of the summary must know."""
-    n_lost = sum(frame.status is SlamStatus.LOST for frame in after)
-    if n_lost:
-        yield f"{n_lost} frames after the start were lost: frames.csv says why"
-    if slam.n_restarts:
-        yield f"{slam.n_restarts} young maps were lost for too long and given up, with their poses"
-    if not len(scene.trajectory) and scene.frames:
-        yield f"no map was begun: {scene.frames[-1].reason}"
 
 
 def warm_up() -> None:

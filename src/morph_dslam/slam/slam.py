@@ -57,6 +57,8 @@ class Slam:
     n_restarts : how many young maps were given up
     is_frozen : whether the map is kept as it is
     frozen_at : frame from which on it froze because the scene deformed, or None
+    n_known : keyframes of a map that was known before
+    n_depths_aside : depth images that were not used because they do not belong to the colour pixels
     """
 
     def __init__(
@@ -72,6 +74,8 @@ class Slam:
         self.newest_view: FrameView | None = None
         self.is_frozen, self.frozen_at = False, None
         self.n_restarts, self.threaded = 0, threaded
+        self.n_known, self.n_depths_aside = 0, 0
+        self._expects_depth = with_depth or self.frame_images.is_stereo or not self.options.use_depth
         self._begin(RigidMap(self.frame_images.baseline_px))
 
     def use_map(self, rigid_map: RigidMap) -> None:
@@ -91,6 +95,7 @@ class Slam:
             # The map's own depths are enough to find the camera in it.
             self.frame_images.baseline_px = 0.0
         self.is_frozen = not self.options.extend
+        self.n_known = len(rigid_map.keyframes)
         self._begin(rigid_map)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -104,6 +109,7 @@ class Slam:
 
     def _restart(self) -> None:
         self.n_restarts += 1
+        self.n_known = 0
         self._begin(RigidMap(self.frame_images.baseline_px))
 
     def finder(self) -> Slam:
@@ -145,6 +151,7 @@ class Slam:
         """
         if self.options.freeze_at is not None and index >= self.options.freeze_at and not self.is_frozen:
             self.freeze()
+        self.n_depths_aside += depth is not None and not self._expects_depth
         waits, is_beside = WaitClock(), self.threaded and self.is_mapping
         with frame_clock(STAGES) as clock:
             with stage("prepare"):
@@ -190,6 +197,11 @@ class Slam:
         placed = [frame for frame in frames if self.is_placed(frame)]
         moved = iter(moved_along(placed, moves, len(self.map.state)))
         return [next(moved) if self.is_placed(frame) else frame for frame in frames]
+
+    @property
+    def knows_map(self) -> bool:
+        """Whether the map was known before the first frame."""
+        return self.n_known > 0
 
     @property
     def n_loops(self) -> int:

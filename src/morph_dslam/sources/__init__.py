@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from os import PathLike
 from pathlib import Path
 
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import SourceError, check_kind
 from morph_dslam.sources.frames import Frame, FrameSource, FrameStream
-from morph_dslam.sources.live import LiveStream, PacedRecording, is_webcam, open_webcam
+from morph_dslam.sources.live import LiveStream, PacedRecording, is_camera, open_camera
 from morph_dslam.sources.local_socket import open_socket
 from morph_dslam.sources.recorded import (
     euroc_recording,
@@ -40,19 +41,23 @@ def register_source(matches: Matches, open: Open) -> None:
 
 
 def open_stream(source: str | Path, first: int | None = None, last: int | None = None) -> FrameStream:
-    """Open a recording as `open_source` does, or a webcam: `webcam:0` is the first one.
+    """Open a recording as `open_source` does, or a camera: `webcam:0`, `/dev/video0`, or a URL such as `rtsp://address`.
 
-    A recording gives every frame, however long each takes; a webcam gives the newest and drops the others.
+    A recording gives every frame, however long each takes; a camera gives the newest and drops the others.
 
-    Raises SourceError if the source is missing or cannot be opened, or the range is not in it.
+    Raises SourceError if the source is missing or cannot be opened, or the range is not in it, and ArgumentError if it
+    is no path: a number of a webcam for example.
     """
+    check_kind(source, (str, PathLike), "the source of frames", "a path, or 'webcam:0' for the first webcam")
     path = Path(source)
     if first is not None and last is not None and last < first:
         raise SourceError(f"frames {first}-{last} of {path}: the last frame is before the first")
     for matches, open_kind in _KINDS:
         if matches(path):
             return open_kind(path, first, last)
-    raise SourceError(f"there is no folder of images and no video at {path} (webcams are webcam:0, webcam:1, ...)")
+    raise SourceError(
+        f"there is no folder of images and no video at {path} (cameras are webcam:0, /dev/video0 or a URL)"
+    )
 
 
 def open_source(path: str | Path, first: int | None = None, last: int | None = None) -> FrameSource:
@@ -77,7 +82,18 @@ def open_source(path: str | Path, first: int | None = None, last: int | None = N
 
 
 def open_live(source: str | Path, first: int | None = None, last: int | None = None) -> LiveStream:
-    """Open a webcam, or a recording that plays as if it were live: frames that come too fast are dropped."""
+    """Open a camera, or a recording that plays as if it were live: frames that come too fast are dropped.
+
+    Parameters
+    ----------
+    source : `webcam:0` for the first webcam, `/dev/video0`, the URL of a camera on the network, or a recording
+    first, last : range of frame numbers of a recording, both included
+
+    Raises
+    ------
+    SourceError
+        If there is no such source, or it cannot be opened.
+    """
     stream = open_stream(source, first, last)
     return stream if isinstance(stream, LiveStream) else PacedRecording(stream)
 
@@ -89,5 +105,5 @@ register_source(is_seven_scenes, seven_scenes_recording)
 register_source(is_euroc, euroc_recording)
 register_source(is_tum, tum_recording)
 register_source(is_bag, RosBag)
-register_source(is_webcam, open_webcam)
+register_source(is_camera, open_camera)
 register_source(Path.is_socket, open_socket)

@@ -143,8 +143,15 @@ def _decode(path: Path, what: str, flags: int) -> NDArray:
     return np.asarray(image)
 
 
-def open_capture(source: str | int) -> cv2.VideoCapture:
-    """A video file, or a webcam by its number, without what OpenCV and FFmpeg print; see its ``isOpened()``."""
+#: How long a camera on the network may take to answer, and then for a frame, milliseconds.
+NETWORK_TIMEOUT_MS = 10_000
+
+
+def open_capture(source: str | int, is_remote: bool = False) -> cv2.VideoCapture:
+    """A video file, a webcam by its number, or what a URL leads to; see its ``isOpened()``.
+
+    What OpenCV and FFmpeg print is kept away. What ``is_remote`` is given up if it is silent for `NETWORK_TIMEOUT_MS`.
+    """
     # FFmpeg's log level AV_LOG_QUIET; it is read once, when the first video is opened.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # Until 4.12 these functions were OpenCV's own, since then they are in a module.
@@ -152,7 +159,11 @@ def open_capture(source: str | int) -> cv2.VideoCapture:
     before = log.getLogLevel()
     log.setLogLevel(0)
     try:
-        return cv2.VideoCapture(source)
+        if not is_remote:
+            return cv2.VideoCapture(source)
+        limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+        parameters = [number for limit in limits for number in (limit, NETWORK_TIMEOUT_MS)]
+        return cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, parameters)
     finally:
         log.setLogLevel(before)
 

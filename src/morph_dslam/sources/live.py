@@ -17,7 +17,9 @@ from morph_dslam.errors import SourceError
 from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, open_capture
 
 Item = TypeVar("Item")
-_WEBCAM = re.compile(r"webcam:(\d+)")
+_WEBCAM = re.compile(r"(?:webcam:|/dev/video)(\d+)")
+#: As a path, which has lost one of two slashes.
+_URL = re.compile(r"(rtsps?|https?|rtmp|udp|tcp):/+(\S+)")
 
 
 class Newest(Generic[Item]):
@@ -133,9 +135,15 @@ class LiveCamera(LiveStream):
     Timestamps are seconds since the first frame.
     """
 
-    def __init__(self, capture: Capture, name: str = "camera", clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        name: str = "camera",
+        clock: Callable[[], float] = time.monotonic,
+        advice: str = "check its cable",
+    ) -> None:
         super().__init__(name, frame_rate(capture))
-        self._capture, self._clock = capture, clock
+        self._capture, self._clock, self._advice = capture, clock, advice
         self.start()
 
     def read(self) -> Iterator[Frame]:
@@ -147,7 +155,7 @@ class LiveCamera(LiveStream):
                 if self.closing:
                     return
                 after = f"after frame {index - 1}" if index else "before the first frame"
-                raise SourceError(f"{self.name} stopped delivering {after}: check its cable")
+                raise SourceError(f"{self.name} stopped delivering {after}: {self._advice}")
             start = now if index == 0 else start
             # Captures may hand out the same memory again.
             yield Frame(index, now - start, np.array(image, dtype=np.uint8), captured=now)
@@ -157,16 +165,26 @@ class LiveCamera(LiveStream):
         self._capture.release()
 
 
-def is_webcam(path: Path) -> bool:
-    """Whether it is written like `webcam:0`."""
-    return _WEBCAM.fullmatch(str(path)) is not None
+def is_camera(path: Path) -> bool:
+    """Whether it is written like `webcam:0`, `/dev/video0` or `rtsp://address`."""
+    return _WEBCAM.fullmatch(str(path)) is not None or _URL.fullmatch(str(path)) is not None
 
 
-def open_webcam(path: Path, first: int | None = None, last: int | None = None) -> LiveCamera:
-    """Open the webcam of this number; SourceError if it is not there, is in use, or a range is asked for."""
+def open_camera(path: Path, first: int | None = None, last: int | None = None) -> LiveCamera:
+    """Open a webcam by its number, or a camera on the network.
+
+    Raises
+    ------
+    SourceError
+        If it is not there, is in use, does not answer, or a range is asked for.
+    """
     if first is not None or last is not None:
-        raise SourceError(f"{path} is live and has no range of frames to choose from")
-    device = int(str(path).partition(":")[2])
+        raise SourceError(f"{_without_password(str(path))} is live and has no range of frames to choose from")
+    if url := _URL.fullmatch(str(path)):
+        return _open_address(f"{url[1]}://{url[2]}")
+    webcam = _WEBCAM.fullmatch(str(path))
+    assert webcam is not None
+    device = int(webcam[1])
     capture = open_capture(device)
     if not capture.isOpened():
         raise SourceError(
@@ -174,6 +192,22 @@ def open_webcam(path: Path, first: int | None = None, last: int | None = None) -
             "and that you may read /dev/video*"
         )
     return LiveCamera(capture, f"webcam {device}")
+
+
+def _open_address(url: str) -> LiveCamera:
+    capture = open_capture(url, is_remote=True)
+    name = _without_password(url)
+    if not capture.isOpened():
+        raise SourceError(
+            f"no video comes from {name}: check the address, its user and password, and that the camera is on and in "
+            "this network"
+        )
+    return LiveCamera(capture, name, advice="check the network, and that the camera is on")
+
+
+def _without_password(url: str) -> str:
+    """A URL, or one as a path, for messages."""
+    return re.sub(r"(:/+)[^/@]*@", r"\1", url)
 
 
 class PacedRecording(LiveStream):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,11 @@ from morph_dslam.sources.frames import (
 )
 
 TUM_DEPTH = DepthScale(values_per_metre=5000.0)
+#: What to correct where lengths that come from depth images are not metres.
+DEPTH_SCALE = (
+    f"the scale of the depth images ({TUM_DEPTH.values_per_metre:g} values a metre in folders of TUM RGB-D, elsewhere "
+    "often 1000)"
+)
 #: Colour and depth are not taken at the same instant; these belong together, seconds.
 MOST_TIME_DIFFERENCE = 0.02
 SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
@@ -81,6 +87,19 @@ class RecordedFrames:
         """Whether frames come with depth that belongs to their pixels."""
         scale = self._depth_scale
         return scale is not None and scale.registered and any(r.depth is not None for r in self._records)
+
+    def with_depth_per_metre(self, values: float) -> RecordedFrames:
+        """The same frames, whose depth images have so many values a metre.
+
+        Raises SourceError if they have none that belong to the colour pixels.
+        """
+        if self._depth_scale is None or not self.has_registered_depth:
+            raise SourceError(
+                f"{self.name} has no depth images that belong to the colour pixels: leave --depth-per-metre out"
+            )
+        other = copy(self)
+        other._depth_scale = replace(self._depth_scale, values_per_metre=values)
+        return other
 
     def __len__(self) -> int:
         return len(self._records)

@@ -114,7 +114,10 @@ def _kind_and_place(text: str) -> tuple[_Kind, str]:
     name, colon, where = text.partition(":")
     kind = _KINDS.get(name)
     if kind is None or (colon and not where):
-        raise StreamError(f"'{text}' is no stream: write {', '.join(_KINDS)}, or one of them with :WHERE behind it")
+        raise StreamError(
+            f"'{text}' is no stream: write {', '.join(_KINDS)}, or one of them with :WHERE behind it; programs that "
+            "send a stream on in another form, OpenIGTLink for one, are in examples/streams"
+        )
     kind.check(where)
     if find_spec(kind.module) is None:
         raise StreamError(f"--stream {name} needs {kind.module}, which is not installed: {kind.mend}")

@@ -138,7 +138,7 @@ def _read_term(
     measured = "ratio" if name is None else parameters[known[name]].quantity
     share = 1.0
     if term["divisor"] is not None:
-        share, measured = _share(term, text, measured, name), "ratio"
+        share, measured = _share(term, text, quantity, known, parameters), "ratio"
     if unit is not None:
         value = to_si(number, unit, quantity) * share
         if name is not None and measured != "ratio":
@@ -153,13 +153,32 @@ def _read_term(
             raise StudyError(f"'{text}' lacks a unit of {quantity}: {', '.join(FACTORS[quantity])}")
         return value, None
     if FACTORS[measured] is not FACTORS[quantity]:
-        raise StudyError(f"'{text}': the parameter {name} is of {measured}, and {quantity} is wanted here")
+        raise StudyError(
+            f"'{text}': the parameter {name} is of {measured}, and {quantity} is wanted here: "
+            f"write {_proportional(quantity, parameters[known[name]])}"
+        )
     return value, name
 
 
-def _share(term: re.Match, text: str, measured: str, name: str | None) -> float:
+def _share(
+    term: re.Match, text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
+) -> float:
     """One over the quantity that a parameter, which measures the same, is divided by."""
-    divisor = possible(float(term["divisor"]), text)
+    divisor, name = possible(float(term["divisor"]), text), term["factor"] or term["name"]
     if name is None or not divisor:
         raise StudyError(f"'{text}': only a parameter can be divided, and not by zero")
-    return 1.0 / to_si(divisor, term["divisor_unit"], measured)
+    parameter = parameters[known[name]]
+    try:
+        return 1.0 / to_si(divisor, term["divisor_unit"], parameter.quantity)
+    except StudyError as error:
+        raise StudyError(
+            f"'{text}': {error}, for {name} is divided by a quantity of its own kind; write "
+            f"{_proportional(quantity, parameter)}"
+        ) from None
+
+
+def _proportional(quantity: str, parameter: Parameter) -> str:
+    """How a quantity that is proportional to a parameter is written."""
+    unit = next(iter(FACTORS[quantity]))
+    factor = "" if quantity == "ratio" else f"10 {unit} * "
+    return f'"{factor}{parameter.name} / 1 {parameter.unit}" for example'

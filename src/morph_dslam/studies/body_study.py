@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,14 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.parameters import ParameterSymbols
+from morph_dslam.mechanics.shell_material import ShellMaterial
+from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
+from morph_dslam.model.reduced_model import state_text
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.sections import JOINED
 from morph_dslam.studies.solid_sections import Reader, Value
 
 Array = NDArray[np.float64]
@@ -33,39 +38,76 @@ def numbered(kind: str, sections: Iterable[Any]) -> list[tuple[str, Any]]:
     return [(f"{kind} {number}", section) for number, section in enumerate(sections, start=1)]
 
 
-#: A set of the mesh that a study names: the key there, its name, and what finds its members.
-NamedSet = tuple[str, str, Callable[[str], NDArray[np.int64]]]
+#: A set of the mesh that a study names: the key there, its name, and what it is a set of.
+NamedSet = tuple[str, str, Literal["nodes", "surface", "cells"]]
 
 
-def check_sets(sets: Iterable[NamedSet]) -> None:
-    """Raise StudyError, which begins with the key, if a set is not in the mesh, or empty."""
-    for key, name, find in sets:
+def with_named_sets(mesh: Mesh, sets: Iterable[NamedSet]) -> Mesh:
+    """The mesh with every set that a study names: joint ones of those listed, surfaces of the faces of node sets.
+
+    Raises StudyError, which begins with the key, if a set is not in the mesh, or empty.
+    """
+    added: dict[str, dict[str, NDArray[np.int64]]] = {"nodes": {}, "surface": {}, "cells": {}}
+    known = {"nodes": {*mesh.node_sets, *mesh.surfaces}, "surface": {*mesh.surfaces}, "cells": {*mesh.cell_sets, "all"}}
+    for key, name, what in sets:
+        names = [name] if name in known[what] | {*mesh.node_sets} else name.split(JOINED)
+        find = {"nodes": mesh.set_nodes, "surface": mesh.faces_in, "cells": mesh.cells}[what]
         try:
-            members = find(name)
+            members = np.unique(np.concatenate([find(part) for part in names]), axis=0)
         except StudyError as error:
             raise StudyError(f"{key}: {error}") from error
         if not len(members):
             raise StudyError(f"{key}: the set '{name}' of the mesh is empty; name another, or fill it")
+        if name not in known[what]:
+            added[what][name] = members
+    return replace(
+        mesh,
+        node_sets={**mesh.node_sets, **added["nodes"]},
+        surfaces={**mesh.surfaces, **added["surface"]},
+        cell_sets={**mesh.cell_sets, **added["cells"]},
+    )
 
 
 def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter]) -> None:
     """Read every value of sections with ``make``, so that a mistake is found before anything is solved.
 
-    Materials are checked at the defaults of the parameters. Raises ValueError saying in which of the ``parts``, named
-    sections, the mistake is.
+    Materials and thicknesses are checked at the defaults of the parameters, and at both ends of the range of each that
+    they depend on. Raises ValueError saying in which of the ``parts``, named sections, the mistake is.
     """
-    defaults = np.array([p.default for p in parameters])
-
-    def read(value: Value, quantity: str | None) -> float:
-        return read_affine(value, quantity, parameters)(defaults)
-
     for where, section in parts:
+        defaults = np.array([p.default for p in parameters])
+        used: set[int] = set()
         try:
-            made = section.make(read)
-            if isinstance(made, Material):
-                made.check()
+            if isinstance(_made(section, parameters, defaults, used), (Material, ShellMaterial, float)):
+                for k in sorted(used):
+                    for end in (parameters[k].lower, parameters[k].upper):
+                        _check_at_end(section, parameters, k, end)
         except StudyError as error:
             raise ValueError(f"{where}: {error}") from error
+
+
+def _made(section: Any, parameters: Sequence[Parameter], mu: Array, used: set[int]) -> Any:
+    """What a section describes at ``mu`` (d,), checked; ``used`` takes the parameters that it depends on."""
+
+    def read(value: Value, quantity: str | None) -> float:
+        found = read_affine(value, quantity, parameters)
+        used.update(np.flatnonzero(found.slopes).tolist())
+        return found(mu)
+
+    made = section.make(read)
+    if isinstance(made, Material):
+        made.check()
+    return made
+
+
+def _check_at_end(section: Any, parameters: Sequence[Parameter], k: int, end: float) -> None:
+    """Raise StudyError, which names the state, if a section cannot be with parameter ``k`` at an end of its range."""
+    mu = np.array([p.default for p in parameters])
+    mu[k] = end
+    try:
+        _made(section, parameters, mu, set())
+    except StudyError as error:
+        raise StudyError(f"{error} where {state_text(parameters[k : k + 1], mu[k])}: change its range") from error
 
 
 def reader_of(symbols: ParameterSymbols) -> Reader:
@@ -84,6 +126,24 @@ class BodyStudy:
     if TYPE_CHECKING:
         parameters: dict[str, ParameterSection]
         model_dump_json: Callable[[], str]
+
+    def _parts(self) -> list[tuple[str, Any]]:
+        """All sections whose values may name parameters, with what messages call them."""
+        raise NotImplementedError
+
+    def check_parameters_used(self, elsewhere: Sequence[str] = ()) -> None:
+        """Raise StudyError if a parameter changes nothing; those named ``elsewhere`` do."""
+        parameters = self.model_parameters()
+        defaults, used = self.root(), set(elsewhere)
+        for _, section in self._parts():
+            numbers: set[int] = set()
+            _made(section, parameters, defaults, numbers)
+            used |= {parameters[k].name for k in numbers}
+        if unused := [parameter.name for parameter in parameters if parameter.name not in used]:
+            raise StudyError(
+                f"the parameter {unused[0]} is used nowhere in the study: name it in a load, a support or a material, "
+                "or leave it out"
+            )
 
     def __hash__(self) -> int:
         return hash(self.model_dump_json())

@@ -13,7 +13,9 @@ import numpy as np
 
 from morph_dslam.errors import StudyError
 from morph_dslam.geometry import fit_similarity
+from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
 from morph_dslam.model import ReducedModel, save_model
+from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
 from morph_dslam.reduction.registry import reduction_method
@@ -25,6 +27,7 @@ from morph_dslam.studies.problem import announce
 from morph_dslam.studies.provenance import locking_warnings, provenance
 from morph_dslam.studies.sections import ReductionSection
 from morph_dslam.studies.shell_study import ShellStudy
+from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
 from morph_dslam.studies.study import Study, load_study
@@ -39,6 +42,10 @@ UNSTRAINED = 1e-7
 UNSURE_LOADS = (
     "responses to unknown loads are off by {:.0f} % between the states where they are known: narrow the ranges of the "
     "parameters"
+)
+DOUBTFUL = (
+    "the model misses {} at held-out solutions: do not rely on what it says of these; take more samples, or narrow the "
+    "ranges of the parameters"
 )
 
 
@@ -82,6 +89,9 @@ def build(
 def _built(study: Study, text: str, output: Path, workers: int | None, executor: Executor | None) -> ReducedModel:
     begin = time.monotonic()
     chosen = resolve_defaults(study)
+    if isinstance(chosen, SolidStudy | ShellStudy):
+        chosen.check_parameters_used()
+        _announce_mesh(chosen)
     snapshots = take_snapshots(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
     model = certified_model(snapshots, chosen.reduction, chosen.name)
     if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
@@ -93,10 +103,25 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         model = replace(model, unknown_loads=loads)
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
-    if found := [*locking_warnings(chosen), *_unstrained(snapshots)]:
+    if found := [*locking_warnings(chosen), *(_unstrained(snapshots) or _doubtful(model))]:
         model.certificate["warnings"] = found
     save_model(output, model)
     return model
+
+
+def _announce_mesh(study: SolidStudy | ShellStudy) -> None:
+    """Print how large the mesh is, for a wrong unit shows there before anything is solved, and which faces were chosen.
+
+    Chosen are those of node sets, or of several sets, that the study names as one surface.
+    """
+    mesh = study.solid_mesh() if isinstance(study, SolidStudy) else study.shell_mesh()
+    announce(f"mesh: {described_mesh(mesh)}")
+    if isinstance(study, SolidStudy):
+        for name in mesh.surfaces.keys() - make_mesh(study.mesh).surfaces.keys():
+            area, _, _ = faces_figures(mesh, mesh.surfaces[name])
+            announce(
+                f"mesh: the surface {name} is the {len(mesh.surfaces[name])} faces of its sets, {1e6 * area:.4g} mm2"
+            )
 
 
 def _unstrained(snapshots: Snapshots) -> list[str]:
@@ -110,6 +135,12 @@ def _unstrained(snapshots: Snapshots) -> list[str]:
         if np.abs(fit.apply(nodes) - nodes - move).max() > UNSTRAINED * max(size, largest):
             return []
     return ["no solution strains the body, all move it as if it were rigid: is a support missing?"]
+
+
+def _doubtful(model: ReducedModel) -> list[str]:
+    """A sentence if stress or forces are reduced too badly for use."""
+    errors = doubtful_errors(model)
+    return [DOUBTFUL.format(errors_in_words(errors))] if errors else []
 
 
 def _read(study: str | Path | Study) -> tuple[Study, str]:

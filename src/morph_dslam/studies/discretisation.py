@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.loads import with_reactions
+from morph_dslam.mechanics.shell_problem import ShellOptions, ShellProblem
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
-from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
+from morph_dslam.mechanics.solvers import newton
+from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.solvers.linear_solver import SolverMaker
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
 from morph_dslam.mechanics.solvers.two_level import LowerOrder, TwoLevelSolver
@@ -31,6 +33,7 @@ from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import Snapshot, announce
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_study import ShellStudy
+from morph_dslam.studies.shell_sweep import shell_snapshot
 from morph_dslam.studies.snapshots import load_state
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solid_sweep import SolidSweep, solid_snapshot
@@ -57,6 +60,8 @@ BYTES_OF_A_MILLION = 45e9
 #: The same of an iterative solve: time in units of a tangent of the study's elements and of the ratio of unknowns
 #: (measured on a seal of 287 thousand), memory of an unknown (6 kB on that seal, 12 kB on hexahedra of third order).
 ITERATIVE_TANGENTS, ITERATIVE_BYTES = 6.0, 12e3
+#: Highest order of a shell's displacements.
+FINEST_SHELL = 3
 #: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
 TOLERANCE, PART = 1e-2, 0.03
 
@@ -90,32 +95,42 @@ def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedMode
         "left_out", why some states are missing. Or only "not_estimated", the reason.
     """
     try:
-        return _estimate(_solid(study), snapshots, model, seconds)
+        return _estimate(_refinable(study), snapshots, model, seconds)
     except _NotEstimated as reason:
         return {"not_estimated": str(reason)}
 
 
-def _solid(study: Study) -> SolidStudy:
+def _refinable(study: Study) -> SolidStudy | ShellStudy:
     """The study, if its solutions can be solved again with finer elements."""
     if isinstance(study, ExternalStudy):
         raise _NotEstimated("the solutions are another program's")
-    if isinstance(study, SheetStudy | ShellStudy):
-        raise _NotEstimated("studies of sheets and shells have no finer elements to compare with")
+    if isinstance(study, SheetStudy):
+        raise _NotEstimated("studies of sheets in grips have no finer elements to compare with")
     if not study.sampling.refined:
         raise _NotEstimated("switched off by sampling.refined = 0")
+    if isinstance(study, ShellStudy):
+        if study.solver.order >= FINEST_SHELL:
+            raise _NotEstimated(f"shells of order {study.solver.order} have no finer elements to compare with")
+        return study
     if study.time is not None:
         raise _NotEstimated("a viscoelastic solid would have to be followed from the beginning with finer elements")
     return study
 
 
 def chosen_states(held_out: Sequence[Snapshot], count: int) -> list[int]:
-    """Up to ``count`` held-out solutions: the one strained most, then typical ones, by the norm of nodal strains."""
-    order = np.argsort([float(np.linalg.norm(snapshot.fields["strain"])) for snapshot in held_out])
+    """Up to ``count`` held-out solutions: the one strained most, then typical ones, by the norm of nodal strains.
+
+    Shells have stresses in place of strains.
+    """
+    strains = ("strain",) if "strain" in held_out[0].fields else ("stress_top", "stress_bottom")
+    order = np.argsort([float(np.linalg.norm([snapshot.fields[name] for name in strains])) for snapshot in held_out])
     places = [round(quantile * (len(order) - 1)) for quantile in QUANTILES[:count]]
     return [int(order[place]) for place in dict.fromkeys(places)]
 
 
-def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seconds: float) -> dict[str, Any]:
+def _estimate(
+    study: SolidStudy | ShellStudy, snapshots: Snapshots, model: ReducedModel, seconds: float
+) -> dict[str, Any]:
     assert snapshots.problem is not None
     begin = time.monotonic()
     sweep = snapshots.problem()
@@ -130,12 +145,12 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
     end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * max(seconds, solving), FLOOR)
     announce(f"solving {len(chosen)} held-out states again with finer elements")
     solved, left_out = {}, ""
-    if not finer.iterative:
-        # From small strains to large ones: where a path has to be followed, it starts from the state before.
-        chosen.sort(key=lambda index: float(np.linalg.norm(snapshots.held_out[index].fields["strain"])))
     for index in chosen:
+        state, pivots = kept[index], int(kept[index]["pivots"])
         try:
-            solved[index] = finer.solve(kept[index]["dofs"], kept[index]["mu"], lambda: time.monotonic() < end)
+            found = finer.solve(state["dofs"], state["mu"], lambda: time.monotonic() < end)
+            _check_same_branch(finer.problem, found, pivots)
+            solved[index] = found
         except OutOfTime:
             left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
             break
@@ -146,6 +161,23 @@ def _estimate(study: SolidStudy, snapshots: Snapshots, model: ReducedModel, seco
     return _figures(model, snapshots, sweep.problem, finer.problem, solved) | (
         {"left_out": left_out} if left_out else {}
     )
+
+
+def _check_same_branch(problem: SolidProblem, found: State, pivots: int) -> None:
+    """Raise SolverError if a finer solution is another equilibrium than the study's own, judged by its stability.
+
+    The difference of two branches is no error of the elements. ``pivots`` are the negative eigenvalues of the study's
+    tangent; -1 where they are unknown.
+    """
+    if pivots < 0 or found.negative_pivots in (None, pivots):
+        return
+    # The last tangent was made before the last correction.
+    own = problem.linearise(found.dofs, found.mu).negative_pivots
+    if own not in (None, pivots):
+        raise SolverError(
+            f"at {newton.where(problem, found.mu)} finer elements lead to an equilibrium of another stability ({own} "
+            f"negative eigenvalues, the study's elements {pivots})"
+        )
 
 
 def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
@@ -176,9 +208,11 @@ def _direct_bytes(unknowns: int) -> float:
     return BYTES_OF_A_MILLION * (1e-6 * unknowns) ** MEMORY_POWER
 
 
-def _finer(study: SolidStudy, coarse: SolidProblem) -> SolidProblem:
-    """The study's solid with displacements of one order more."""
+def _finer(study: SolidStudy | ShellStudy, coarse: SolidProblem) -> SolidProblem:
+    """The study's solid or shell with displacements of one order more."""
     order = coarse.displacements.order + 1
+    if isinstance(study, ShellStudy):
+        return study.problem(ShellOptions(order=order, threads=coarse.options.threads))
     options = SolidOptions(order=order, serendipity=True, at_nodes=True, threads=coarse.options.threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # the study's elements were warned about
@@ -219,14 +253,14 @@ class HigherOrder:
         self._coarse, self.problem = coarse, problem
         n = 3 * problem.displacements.n_scalar
         self.iterative = _direct_bytes(n) > MOST_BYTES and not problem.assembly.coupled[n:].any()
-        self._latest: State | None = None
 
     def solve(self, dofs: Array, mu: Array, in_time: Callable[[], bool] = lambda: True) -> State:
         """The solution at ``mu`` (d,) next to one of the coarse solid, to a few percent of the difference.
 
         First the unknowns that only the finer elements have are solved for, with the coarse solution ``dofs`` (n,)
         held: as finer displacements this one is strained far too much in bending, and Newton's method would take long
-        from it. Where it does not converge, the path from the state solved before is followed in increments.
+        from it. Where it does not converge, the forces that the start lacks for balance fade away in increments, so
+        that the solution is on the same branch.
 
         Raises
         ------
@@ -237,17 +271,16 @@ class HigherOrder:
         """
         make = partial(TwoLevelSolver, lower=self._lower_order(dofs, mu)) if self.iterative else None
         equations, given = _Stoppable(self.problem, in_time, make), self._embedded(dofs)
+        start = State(mu, given)
         try:
-            state = solve(_Added(self.problem, in_time, self._kept, given, make), mu, State(mu, given), TOLERANCE)
-            tolerance = PART * size(equations, state.dofs - given)
-            state = solve(equations, mu, state, tolerance)
+            start = solve(_Added(self.problem, in_time, self._kept, given, make), mu, start, TOLERANCE)
+            # Where finer elements change nothing, a part of the change would be less than rounding.
+            tolerance = max(PART * size(equations, start.dofs - given), newton.TOLERANCE)
+            return solve(equations, mu, start, tolerance)
         except SolverError:
             if self.iterative:
                 raise  # a path would take as long as many states
-            start = self._latest or loaded_state(equations, self.problem.symbols.default)
-            state = advance(equations, start, mu, PART * TOLERANCE)[-1]
-        self._latest = state
-        return state
+            return loaded_state(equations, mu, start.dofs, PART * TOLERANCE)
 
     @cached_property
     def _kept(self) -> NDArray[np.bool_]:
@@ -308,13 +341,19 @@ class _Added(_Stoppable):
         return np.where(self._kept & self._problem.free, self._given, prescribed)
 
 
+def _snapshot(problem: SolidProblem, state: State) -> Snapshot:
+    if isinstance(problem, ShellProblem):
+        return shell_snapshot(problem, state.dofs, state.mu)
+    return solid_snapshot(problem, state.dofs, state.mu)
+
+
 def _figures(
     model: ReducedModel, snapshots: Snapshots, coarse: SolidProblem, finer: SolidProblem, solved: dict[int, State]
 ) -> dict[str, Any]:
     """Errors of the held-out solutions against the finer ones, field by field."""
     reactions = [name.removeprefix(REACTION) for name in model.fields if name.startswith(REACTION)]
     pairs = [
-        (snapshots.held_out[index], with_reactions(solid_snapshot(finer, state.dofs, state.mu), reactions))
+        (snapshots.held_out[index], with_reactions(_snapshot(finer, state), reactions))
         for index, state in sorted(solved.items())
     ]
     return {

@@ -6,7 +6,6 @@ are not known, so the functions of the parameters are fitted to values only.
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.text import read_csv
 from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.problem import ModelMesh, Snapshot
@@ -125,14 +125,8 @@ class ExternalStudy(Section):
 
 def read_table(path: Path) -> tuple[tuple[Parameter, ...], Array, list[dict[str, str]]]:
     """The parameter table: parameters, their values (n, d) in SI, and the rows."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header, rows = [name.strip() for name in reader.fieldnames or []], []
-            for row in reader:
-                rows.append({(key or "").strip(): value for key, value in row.items()})
-    except OSError as error:
-        raise StudyError(f"cannot read the table {path}: {error.strerror}") from error
+    (_, header), *lines = read_csv(path, "table", StudyError) or [(1, [])]
+    rows = [dict(zip(header, cells + [""] * len(header), strict=False)) for _, cells in lines]
     if "file" not in header or not rows:
         raise StudyError(f"{path} needs a column 'file' and a row for each solution")
     _check_listed_once(path, rows)

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.point_location import material_points
+from morph_dslam.errors import ParameterError, StudyError
 from morph_dslam.meshing.netgen_meshing import read_surface
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.inner_structure import InnerStructure
@@ -30,8 +29,8 @@ def place_inner_structure(model: ReducedModel, name: str, nodes: Array, triangle
     if not model.cells:
         raise StudyError(f"'{model.name}' is the model of a surface: it has no inside for '{name}'")
     try:
-        points = material_points(model, nodes)
-    except StudyError as error:
+        points = model.points(nodes)
+    except ParameterError as error:
         low, high = (
             ", ".join(f"{1e3 * value:.1f}" for value in corner)
             for corner in (model.nodes.min(axis=0), model.nodes.max(axis=0))

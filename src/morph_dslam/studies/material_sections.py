@@ -14,7 +14,7 @@ from pydantic import ConfigDict, ValidationInfo, model_validator
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.library import constant_quantities, material_from_table
-from morph_dslam.studies.sections import Section
+from morph_dslam.studies.sections import Section, SetName
 from morph_dslam.studies.solid_sections import Reader
 
 _SERIES = {"relative_moduli": "ratio", "bulk_moduli": "ratio", "times": "time"}
@@ -32,7 +32,7 @@ class MaterialSection(Section):
 
     model_config = ConfigDict(extra="allow", frozen=True)
     law: str
-    on: str = "all"
+    on: SetName = "all"
 
     @model_validator(mode="before")
     @classmethod

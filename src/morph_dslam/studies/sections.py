@@ -45,6 +45,18 @@ def quantity(kind: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
+#: Between the names of sets that a study lists together.
+JOINED = "+"
+
+
+def _joined(value: Any) -> Any:
+    if isinstance(value, list | tuple) and value and all(isinstance(name, str) for name in value):
+        return JOINED.join(value)
+    return value
+
+
+#: The name of a set of the mesh, or the names of several listed, which stand for all that is in one of them.
+SetName = Annotated[str, BeforeValidator(_joined)]
 #: A plain number of a study: a ratio, a component of a direction.
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Length = Annotated[float, quantity("length")]
@@ -173,7 +185,7 @@ class UnknownLoadsSection(Section):
     whatever their direction.
     """
 
-    on: str = ""
+    on: SetName = ""
     direction: Literal["inward", "any"] = "inward"
     modes: int = Field(default=30, ge=1, le=300)
 

@@ -21,7 +21,7 @@ from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import Affine, read_affine
-from morph_dslam.studies.sections import Length, LengthUnit, Section, StudyPath
+from morph_dslam.studies.sections import Length, LengthUnit, Section, SetName, StudyPath
 from morph_dslam.studies.solid_sections import Reader, Value
 from morph_dslam.studies.solution_files import SAME, point_data, read_solution
 from morph_dslam.units import to_si
@@ -51,8 +51,8 @@ class _ThicknessShape(_ShapeSection):
     """A wall that is thicker by ``amplitude``: surface ``on`` moves outwards, surface ``kept`` stays."""
 
     kind: Literal["thickness"]
-    on: str
-    kept: str
+    on: SetName
+    kept: SetName
 
     def moves(self, mesh: Mesh) -> Array:
         return thickness_field(mesh, self.on, self.kept)

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics import loads, supports
+from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.shell_material import ShellMaterial, isotropic
 from morph_dslam.mechanics.shell_supports import Clamp, SymmetryPlane, clamped
 from morph_dslam.meshing import surface_generators
@@ -19,13 +20,14 @@ from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_surface_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.meshing.surface_checks import check_surface
-from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section
+from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section, SetName
 from morph_dslam.studies.solid_sections import (
     BodyForceLoad,
     Count,
     DisplacementSupport,
     FileMesh,
     FixedSupport,
+    ForceLoad,
     FoundationSupport,
     GravityLoad,
     MovingLineLoad,
@@ -197,7 +199,10 @@ class ShellSection(Section):
 
     def make(self, read: Reader) -> Any:
         """The thickness, m."""
-        return read(self.thickness, "length")
+        thickness = read(self.thickness, "length")
+        if not evaluate(thickness) > 0.0:
+            raise StudyError(f"thickness = {evaluate(thickness):g} m must be positive")
+        return thickness
 
 
 class ShellMaterialSection(Section):
@@ -249,7 +254,7 @@ class _ClampedSupport(Section):
     """Holds a set in place and its edges in their direction."""
 
     kind: Literal["clamped"]
-    on: str
+    on: SetName
 
     def make(self, read: Reader) -> Clamp:
         return clamped(self.on)
@@ -259,7 +264,7 @@ class _SymmetrySupport(Section):
     """Keeps a set in its plane across ``axis``, "x", "y" or "z", and the shell there perpendicular to that plane."""
 
     kind: Literal["symmetry"]
-    on: str
+    on: SetName
     axis: Literal["x", "y", "z"]
 
     def make(self, read: Reader) -> SymmetryPlane:
@@ -281,14 +286,14 @@ class _ShellRotationSupport(RotationSupport):
 class _ShellFoundationSupport(FoundationSupport):
     """Springs spread over a cell set, all cells if absent: ``stiffness`` is force per area and displacement."""
 
-    on: str = "all"
+    on: SetName = "all"
 
 
 class _ShellTractionLoad(Section):
     """Force per undeformed area of a cell set that keeps its direction."""
 
     kind: Literal["traction"]
-    on: str = "all"
+    on: SetName = "all"
     traction: Triple
 
     def make(self, read: Reader) -> loads.DeadTraction:
@@ -302,7 +307,7 @@ class _ShellPressureLoad(Section):
     """
 
     kind: Literal["pressure"]
-    on: str = "all"
+    on: SetName = "all"
     pressure: Value
 
     def make(self, read: Reader) -> loads.FollowerPressure:
@@ -313,11 +318,17 @@ class EdgeLoadSection(Section):
     """Force per undeformed length of the edges of a set that keeps its direction."""
 
     kind: Literal["edge"]
-    on: str
+    on: SetName
     force: Triple
 
     def make(self, read: Reader) -> loads.EdgeLoad:
         return loads.EdgeLoad(self.on, triple(self.force, "force per length", read))
+
+
+class _ShellForceLoad(ForceLoad):
+    """A force spread evenly over a cell set, which keeps its direction."""
+
+    on: SetName = "all"
 
 
 class _ShellPatchLoad(MovingPatchLoad):
@@ -326,13 +337,13 @@ class _ShellPatchLoad(MovingPatchLoad):
     ``width`` is the standard deviation of its Gaussian density, at least about half an element.
     """
 
-    on: str = "all"
+    on: SetName = "all"
 
 
 class _ShellLineLoad(MovingLineLoad):
     """A force per length along a straight line over a cell set; ``centre`` may move with a parameter."""
 
-    on: str = "all"
+    on: SetName = "all"
 
 
 ShellSupportSection = Annotated[
@@ -346,6 +357,7 @@ ShellSupportSection = Annotated[
 ]
 ShellLoadSection = Annotated[
     _ShellTractionLoad
+    | _ShellForceLoad
     | _ShellPressureLoad
     | BodyForceLoad
     | GravityLoad

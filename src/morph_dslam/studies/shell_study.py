@@ -12,7 +12,15 @@ from pydantic import Field, field_validator, model_validator
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.shell_problem import ShellOptions, ShellProblem
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
-from morph_dslam.studies.body_study import BodyStudy, NamedSet, check_names, check_sets, numbered, read_once, reader_of
+from morph_dslam.studies.body_study import (
+    BodyStudy,
+    NamedSet,
+    check_names,
+    numbered,
+    read_once,
+    reader_of,
+    with_named_sets,
+)
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
@@ -30,7 +38,7 @@ from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import mesh_fingerprint
 
 #: Kinds of supports and loads that name a cell set; others name nodes.
-_ON_CELLS = ("foundation", "traction", "pressure", "body_force", "moving_patch", "moving_line")
+_ON_CELLS = ("foundation", "traction", "force", "pressure", "body_force", "moving_patch", "moving_line")
 
 
 class _ShellSolverSection(WorkSection):
@@ -60,7 +68,7 @@ class ShellStudy(BodyStudy, Section):
     @model_validator(mode="after")
     def _check_values(self) -> ShellStudy:
         """Read every value once, so that a mistake is found before anything is solved."""
-        read_once([("shell", self.shell), ("material", self.material), *self._listed()], self.model_parameters())
+        read_once(self._parts(), self.model_parameters())
         if any(getattr(part, "first", False) for part in (*self.supports, *self.loads)):
             raise ValueError("first is for solids: leave it out, or let a parameter say how much of a load acts")
         if self.material.density is None and any(load.kind == "gravity" for load in self.loads):
@@ -74,19 +82,21 @@ class ShellStudy(BodyStudy, Section):
 
     def shell_mesh(self) -> Mesh:
         """The mesh with the sets of the study, checked together with those that it names."""
-        mesh = shell_mesh(self.mesh, self.sets)
-        check_sets(self._sets(mesh))
-        return mesh
+        return with_named_sets(shell_mesh(self.mesh, self.sets), self._sets())
+
+    def _parts(self) -> list[tuple[str, Any]]:
+        """Shell, material, supports and loads with what messages call them."""
+        return [("shell", self.shell), ("material", self.material), *self._listed()]
 
     def _listed(self) -> list[tuple[str, Any]]:
         """Supports and loads with what messages call them."""
         return [*numbered("support", self.supports), *numbered("load", self.loads)]
 
-    def _sets(self, mesh: Mesh) -> Iterator[NamedSet]:
+    def _sets(self) -> Iterator[NamedSet]:
         """The sets that the study names."""
         for where, section in self._listed():
             if section.kind != "gravity":
-                yield f"{where}: on", section.on, mesh.cells if section.kind in _ON_CELLS else mesh.set_nodes
+                yield f"{where}: on", section.on, "cells" if section.kind in _ON_CELLS else "nodes"
 
     def fingerprint(self) -> str:
         """Hash of mesh, shell, material, supports, loads, parameters' names, elements and solver version."""
@@ -97,8 +107,8 @@ class ShellStudy(BodyStudy, Section):
         content["code"] = SOLVER_VERSION
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def problem(self) -> ShellProblem:
-        """The discretised shell."""
+    def problem(self, options: ShellOptions | None = None) -> ShellProblem:
+        """The discretised shell, with the study's own elements if ``options`` name no others."""
         symbols = ParameterSymbols(self.model_parameters())
         read = reader_of(symbols)
         return ShellProblem(
@@ -108,7 +118,7 @@ class ShellStudy(BodyStudy, Section):
             [section.make(read) for section in self.supports],
             [section.make(read) for section in self.loads],
             symbols,
-            ShellOptions(order=self.solver.order, threads=self.work.threads),
+            options or ShellOptions(order=self.solver.order, threads=self.work.threads),
         )
 
     def sweep_problem(self) -> SweepProblem:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,18 @@ from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.solid_sweep import SolidSweep, response_reactions, support_reactions
 
 Array = NDArray[np.float64]
+
+
+def shell_snapshot(problem: ShellProblem, dofs: Array, mu: Array) -> Snapshot:
+    """Displacement, stresses of both faces and reactions of a solution, without derivatives.
+
+    Parameters
+    ----------
+    problem : the shell.
+    dofs : (n,) of the solution.
+    mu : (d,) parameters, SI.
+    """
+    return Snapshot(mu, problem.sample(dofs, mu), outputs=support_reactions(problem, dofs, mu))
 
 
 class ShellSweep(SolidSweep):
@@ -40,9 +53,8 @@ class ShellSweep(SolidSweep):
     def take_snapshot(self, state: Any) -> Snapshot:
         """Displacement, stresses of both faces and their slopes, reactions, and the tangent's negative pivots."""
         problem = self.problem
-        fields = problem.sample(state.dofs, state.mu)
+        found = shell_snapshot(problem, state.dofs, state.mu)
         slopes = problem.sample_slopes(state.dofs, state.mu, state.slopes)
-        outputs = support_reactions(problem, state.dofs, state.mu)
         if state.negative_pivots is not None:
-            outputs["negative_pivots"] = np.array(state.negative_pivots)
-        return Snapshot(state.mu, fields, slopes, outputs)
+            found.outputs["negative_pivots"] = np.array(state.negative_pivots)
+        return replace(found, sensitivities=slopes)

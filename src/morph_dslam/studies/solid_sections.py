@@ -24,7 +24,7 @@ from morph_dslam.meshing.extrusion import Hole, extrusion
 from morph_dslam.meshing.mesh_checks import LARGEST, MOST_CELLS, SMALLEST, check_mesh, described_extent
 from morph_dslam.meshing.mesh_files import load_closed_surface, load_mesh
 from morph_dslam.meshing.meshes import Mesh
-from morph_dslam.studies.sections import Angle, LengthUnit, Number, PositiveLength, Section, StudyPath
+from morph_dslam.studies.sections import Angle, LengthUnit, Number, PositiveLength, Section, SetName, StudyPath
 from morph_dslam.units import to_si
 
 CellName = Literal["hex8", "hex20", "hex27", "tet4", "tet10", "prism6", "prism15", "prism18"]
@@ -243,7 +243,7 @@ class FixedSupport(Section):
     """Holds a set in all three directions."""
 
     kind: Literal["fixed"]
-    on: str
+    on: SetName
     first: ClassVar[bool] = False
 
     def make(self, read: Reader) -> supports.PrescribedDisplacement:
@@ -254,7 +254,7 @@ class DisplacementSupport(_Applied):
     """Moves a set by given lengths; a direction that is left out stays free."""
 
     kind: Literal["displacement"]
-    on: str
+    on: SetName
     x: Value | None = None
     y: Value | None = None
     z: Value | None = None
@@ -272,7 +272,7 @@ class RotationSupport(_Applied):
     """
 
     kind: Literal["rotation"]
-    on: str
+    on: SetName
     axis: tuple[Number, Number, Number]
     angle: Value
     centre: Triple | str | None = None
@@ -293,7 +293,7 @@ class FoundationSupport(Section):
     """Springs spread over a surface: ``stiffness`` is force per area and displacement."""
 
     kind: Literal["foundation"]
-    on: str
+    on: SetName
     stiffness: Value
     normal_only: bool = False
     first: ClassVar[bool] = False
@@ -306,7 +306,7 @@ class _TractionLoad(_Applied):
     """Force per undeformed area that keeps its direction."""
 
     kind: Literal["traction"]
-    on: str
+    on: SetName
     traction: Triple
 
     def make(self, read: Reader) -> loads.DeadTraction:
@@ -317,7 +317,7 @@ class _PressureLoad(_Applied):
     """Pressure that follows the deformed surface; positive pushes inwards."""
 
     kind: Literal["pressure"]
-    on: str
+    on: SetName
     pressure: Value
 
     def make(self, read: Reader) -> loads.FollowerPressure:
@@ -328,7 +328,7 @@ class BodyForceLoad(_Applied):
     """Force per undeformed volume of a cell set."""
 
     kind: Literal["body_force"]
-    on: str = "all"
+    on: SetName = "all"
     force: Triple
 
     def make(self, read: Reader) -> loads.BodyForce:
@@ -349,11 +349,22 @@ class PointLoadSection(_Applied):
     """A force shared equally by the nodes of a set."""
 
     kind: Literal["point"]
-    on: str
+    on: SetName
     force: Triple
 
     def make(self, read: Reader) -> loads.PointLoad:
         return loads.PointLoad(self.on, triple(self.force, "force", read))
+
+
+class ForceLoad(_Applied):
+    """A force spread evenly over a surface, which keeps its direction."""
+
+    kind: Literal["force"]
+    on: SetName
+    force: Triple
+
+    def make(self, read: Reader) -> loads.SurfaceForce:
+        return loads.SurfaceForce(self.on, triple(self.force, "force", read))
 
 
 class MovingPatchLoad(_Applied):
@@ -363,7 +374,7 @@ class MovingPatchLoad(_Applied):
     """
 
     kind: Literal["moving_patch"]
-    on: str
+    on: SetName
     force: Triple
     centre: Triple
     width: PositiveLength
@@ -377,7 +388,7 @@ class MovingLineLoad(_Applied):
     """A force per length along a straight line over a surface; ``centre`` may move with a parameter."""
 
     kind: Literal["moving_line"]
-    on: str
+    on: SetName
     force: Triple
     centre: Triple
     direction: tuple[Number, Number, Number]
@@ -395,7 +406,7 @@ class CouplingSection(_Applied):
     ``held`` stay zero: those of the point along the axes, and turns about them.
     """
 
-    on: str
+    on: SetName
     point: Triple | None = None
     force: Triple = ("0 N", "0 N", "0 N")
     moment: Triple = ("0 N.m", "0 N.m", "0 N.m")
@@ -411,7 +422,7 @@ class _PlaneContact(Section):
     """A rigid plane that a surface cannot pass; ``normal`` points towards the solid."""
 
     kind: Literal["plane"]
-    on: str
+    on: SetName
     point: Triple
     normal: tuple[Number, Number, Number]
 
@@ -423,7 +434,7 @@ class _SphereContact(Section):
     """A rigid sphere that a surface cannot enter, or cannot leave where it is ``inside``."""
 
     kind: Literal["sphere"]
-    on: str
+    on: SetName
     centre: Triple
     radius: Value
     inside: bool = False
@@ -440,7 +451,7 @@ class _CylinderContact(Section):
     """
 
     kind: Literal["cylinder"]
-    on: str
+    on: SetName
     point: Triple
     axis: tuple[Number, Number, Number]
     radius: Value
@@ -459,7 +470,7 @@ class _MeshContact(Section):
     """
 
     kind: Literal["mesh"]
-    on: str
+    on: SetName
     file: StudyPath
     unit: LengthUnit
     place: Triple = ("0 mm", "0 mm", "0 mm")
@@ -474,8 +485,8 @@ class _SurfaceContact(Section):
     """A surface that cannot pass through another, ``against``, or through itself where that is absent."""
 
     kind: Literal["surface"]
-    on: str
-    against: str | None = None
+    on: SetName
+    against: SetName | None = None
 
     def make(self, read: Reader) -> contact.SurfaceContact:
         return contact.SurfaceContact(self.on, self.against or self.on)
@@ -485,7 +496,14 @@ SupportSection = Annotated[
     FixedSupport | DisplacementSupport | RotationSupport | FoundationSupport, Field(discriminator="kind")
 ]
 LoadSection = Annotated[
-    _TractionLoad | _PressureLoad | BodyForceLoad | GravityLoad | PointLoadSection | MovingPatchLoad | MovingLineLoad,
+    _TractionLoad
+    | ForceLoad
+    | _PressureLoad
+    | BodyForceLoad
+    | GravityLoad
+    | PointLoadSection
+    | MovingPatchLoad
+    | MovingLineLoad,
     Field(discriminator="kind"),
 ]
 ContactSection = Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,15 @@ from morph_dslam.mechanics.supports import held_still
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.body_study import BodyStudy, NamedSet, check_names, check_sets, numbered, read_once, reader_of
+from morph_dslam.studies.body_study import (
+    BodyStudy,
+    NamedSet,
+    check_names,
+    numbered,
+    read_once,
+    reader_of,
+    with_named_sets,
+)
 from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
@@ -43,8 +51,12 @@ from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
 
 #: `SolidOptions.mixed` by the name of a formulation.
 MIXED = {"automatic": None, "displacement": False, "mixed": True}
-#: Kinds of supports, loads and shapes that name a surface; other sections take node sets too.
-_ON_SURFACES = ("foundation", "traction", "pressure", "moving_patch", "moving_line", "thickness")
+#: Kinds of supports, loads, contacts and shapes that name a surface, and those that name cells; others name nodes.
+_ON_SURFACES = (
+    "foundation", "traction", "force", "pressure", "moving_patch", "moving_line", "thickness",
+    "plane", "sphere", "cylinder", "mesh", "surface",
+)  # fmt: skip
+_ON_CELLS = ("body_force",)
 
 
 class _SolidSolverSection(WorkSection):
@@ -154,6 +166,10 @@ class SolidStudy(BodyStudy, Section):
         }
         return [part for kind, sections in groups.items() for part in numbered(kind, sections)]
 
+    def check_parameters_used(self, elsewhere: Sequence[str] = ()) -> None:
+        """See `BodyStudy`; the time needs not be named."""
+        super().check_parameters_used([*elsewhere, self.time.parameter] if self.time else elsewhere)
+
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
     @property
@@ -163,22 +179,20 @@ class SolidStudy(BodyStudy, Section):
 
     def solid_mesh(self) -> Mesh:
         """The mesh, checked together with the sets that the study names."""
-        mesh = make_mesh(self.mesh)  # type: ignore[arg-type]
-        check_sets(self._sets(mesh))
-        return mesh
+        return with_named_sets(make_mesh(self.mesh), self._sets())  # type: ignore[arg-type]
 
-    def _sets(self, mesh: Mesh) -> Iterator[NamedSet]:
+    def _sets(self) -> Iterator[NamedSet]:
         """The sets that the study names."""
         for name, material in self.materials.items():
-            yield f"materials.{name}.on", material.on, mesh.cells
+            yield f"materials.{name}.on", material.on, "cells"
         for where, section in self._listed():
             kind = getattr(section, "kind", "coupling")
-            find = mesh.cells if kind == "body_force" else mesh.surface if kind in _ON_SURFACES else mesh.set_nodes
+            what = "surface" if kind in _ON_SURFACES else "cells" if kind in _ON_CELLS else "nodes"
             for key in ("on", "against", "kept"):
                 if name := getattr(section, key, None):
-                    yield f"{where}: {key}", name, find
+                    yield f"{where}: {key}", name, what
         if self.unknown_loads:
-            yield "unknown_loads.on", self.unknown_loads.on, mesh.surface
+            yield "unknown_loads.on", self.unknown_loads.on, "surface"
 
     def fingerprint(self) -> str:
         """Hash of mesh, shape, mechanics, parameters' names, elements and solver version."""

@@ -128,10 +128,7 @@ def follow(problem: SolidProblem, start: State, target: Array) -> State:
     try:
         return advance(problem, start, target)[-1]
     except PathError as error:
-        last = ", ".join(
-            f"{parameter.name} {parameter.display(value):.5g} {parameter.unit}".removesuffix(" 1")
-            for parameter, value in zip(problem.symbols.parameters, error.states[-1].mu, strict=True)
-        )
+        last = problem.state_text(error.states[-1].mu)
         raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged") from error
 
 

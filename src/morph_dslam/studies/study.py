@@ -15,10 +15,15 @@ from pydantic import ValidationError
 from morph_dslam.errors import StudyError
 from morph_dslam.io.sections import explain
 from morph_dslam.io.text import read_toml
+from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_sections import shell_mesh
 from morph_dslam.studies.shell_study import ShellStudy
+from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.units import to_si
 
 Study = SheetStudy | ShellStudy | SolidStudy | ExternalStudy
 
@@ -54,6 +59,27 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
         return kind.model_validate(dict(content), context={"folder": Path(folder)})
     except ValidationError as error:
         raise StudyError(f"{where}: {explain(kind, error, content)}") from error
+
+
+def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
+    """The mesh of a study file, whatever sets the study names, or of a mesh file.
+
+    Raises StudyError as `load_study` and `load_mesh`, or if a study has no mesh.
+
+    Parameters
+    ----------
+    path : study file (.toml) or mesh file.
+    unit : of a mesh file's coordinates.
+    size : longest edge of a cell in that unit, where Netgen meshes a mesh file's volume.
+    """
+    if path.suffix != ".toml":
+        return load_mesh(path, unit, None if size is None else to_si(size, unit, "length"))
+    study = load_study(path)
+    if isinstance(study, SolidStudy):
+        return make_mesh(study.mesh)
+    if isinstance(study, ShellStudy):
+        return shell_mesh(study.mesh, study.sets)
+    raise StudyError(f"{path} has no [mesh]: sheets in grips and solutions of other programs have no sets to name")
 
 
 def _kind(content: Mapping[str, Any]) -> type[Study]:

@@ -9,7 +9,7 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.model.shown_field import shown_field
 from morph_dslam.registration.registration import Registration
 from morph_dslam.streams.destinations import check_destination
-from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NOT_IN_EQUILIBRIUM
+from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NO_MAP, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.setup import TrackedObject
 from morph_dslam.tracking.still import TERM_STD
@@ -35,10 +35,7 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
         lambda part: _n_starts(part) != 1,
         "say where the object is, in one way: by landmarks, a registration in a map, a board, a picture or a guess",
     ),
-    (
-        lambda part: part.tracker.pose == "fixed" and part.registration is None,
-        "a pose is held fixed by a map: give the object's registration in it, --registration",
-    ),
+    (lambda part: part.tracker.pose == "fixed" and part.registration is None, f"{NO_MAP}, --registration"),
     (
         lambda part: part.at_rest and part.landmarks is None,
         "the frame of the landmarks shows the object at rest: start from landmarks, or leave out --at-rest",

@@ -81,6 +81,11 @@ class PointDepths:
         """How many points have depth."""
         return int((self.weights > 0.0).sum())
 
+    def ratio_to(self, expected: Array) -> float | None:
+        """Median of the measured depths as shares of others (p,), metres; None where none was measured."""
+        rows = self.weights > 0.0
+        return float(np.median(self.depths[rows] / expected[rows])) if rows.any() else None
+
     def variance_px(self, residuals: Array) -> float:
         """Variance of the residuals (p,): as taken for granted, or what they show if that is more."""
         bounded = np.clip(residuals, -self.huber_px, self.huber_px)

@@ -23,6 +23,7 @@ from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, farthes
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.option_values import CheckedOptions, Positive, PositiveCount
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints, State
 
@@ -32,7 +33,7 @@ STRAINS_A_SAMPLE = 0.2
 
 
 @dataclass(frozen=True)
-class DiscrepancyOptions:
+class DiscrepancyOptions(CheckedOptions):
     """What is taken for likely before any image is seen.
 
     Attributes
@@ -48,16 +49,16 @@ class DiscrepancyOptions:
     steps : Gauss-Newton steps in a frame; one will do from the discrepancy of the frame before.
     """
 
-    amplitude: float = 0.02
-    length: float = 0.2
-    strain: float = 3e-3
-    centres: int = 30
-    samples: int = 100
-    neighbours: int = 6
-    point_px: float = 0.5
-    outline_px: float = 2.0
-    huber_px: float = 1.5
-    steps: int = 2
+    amplitude: Positive = 0.02
+    length: Positive = 0.2
+    strain: Positive = 3e-3
+    centres: PositiveCount = 30
+    samples: PositiveCount = 100
+    neighbours: PositiveCount = 6
+    point_px: Positive = 0.5
+    outline_px: Positive = 2.0
+    huber_px: Positive = 1.5
+    steps: PositiveCount = 2
 
 
 @dataclass(frozen=True)

@@ -368,7 +368,7 @@ def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults
         if maps is not None:
             image = np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
         if state is None:
-            return with_caption(image, f"frame {frame.index}: {result.reason}")
+            return with_caption(image, f"frame {frame.index}: {result.status}: {result.reason}")
         return view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps)
 
     # Frames that may be missing after those of the run are read ahead, but never asked for.

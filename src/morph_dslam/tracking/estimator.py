@@ -23,6 +23,7 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
 from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
 from morph_dslam.tracking.noise import Correlation, Observations, quadratic
+from morph_dslam.tracking.option_values import CheckedOptions, NotNegative, Positive, PositiveCount
 from morph_dslam.tracking.patches import FAST
 from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
 
@@ -342,7 +343,7 @@ BOUND_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
-class EstimationOptions:
+class EstimationOptions(CheckedOptions):
     """When to stop, and what is too far off.
 
     Attributes
@@ -354,9 +355,9 @@ class EstimationOptions:
     loads : how unknown loads are estimated, where the model has them.
     """
 
-    huber_px: float = 3.0
-    max_iterations: int = 25
-    tolerance: float = 1e-5
+    huber_px: Positive = 3.0
+    max_iterations: PositiveCount = 25
+    tolerance: NotNegative = 1e-5
     loads: LoadOptions = field(default_factory=LoadOptions)
 
 

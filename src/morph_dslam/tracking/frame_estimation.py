@@ -29,6 +29,7 @@ from morph_dslam.tracking.noise import (
 )
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import DepthNotUsed
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.reference import ReferenceView
@@ -46,6 +47,8 @@ CLEARLY_BETTER = 0.95
 SCOUTED = 80
 #: The least spread of residuals, pixels, that is believed when they are weighed against depths.
 LEAST_SIGMA_PX = 0.1
+#: Depths this many times as far as the points have the object are in another unit, or of another camera.
+MOST_TIMES = 1.5
 #: A start off a bound is this share of the range inside of it.
 OFF_BOUND = 0.02
 
@@ -316,19 +319,22 @@ class FrameEstimation:
         return trace_of_share(hessian, part, self._estimator.scale)
 
     def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
-        """Estimate with the depths of the supporting points too, if a depth camera saw them."""
-        if picture.depth is None or attempt.outline_alone:
+        """Estimate with the depths of the supporting points too, if a depth camera saw them where they are."""
+        if not self._options.use_depth or attempt.outline_alone:
             return attempt
+        if picture.depth is None:
+            return replace(attempt, depth_unused=DepthNotUsed())
         # Points whose windows overlap err alike in the image, and each counts for less than its depth does.
         squared_px = self._reference.redundancy * max(attempt.estimate.sigma_px, LEAST_SIGMA_PX) ** 2
         pixels, camera, sigma = attempt.measurement.pixels, self._estimator.camera, self._options.depth_sigma
-        depths = PointDepths.sampled(picture.depth, pixels, attempt.inliers, camera, squared_px, sigma).padded(
-            len(self._reference.all_points)
-        )
-        attempt = replace(attempt, depths=depths)
+        depths = PointDepths.sampled(picture.depth, pixels, attempt.inliers, camera, squared_px, sigma)
+        ratio = depths.ratio_to(self._reference.points.in_camera(attempt.estimate.state)[:, 2])
+        if ratio is None or not 1.0 / MOST_TIMES < ratio < MOST_TIMES:
+            return replace(attempt, depth_unused=DepthNotUsed(ratio))
+        attempt = replace(attempt, depths=depths.padded(len(self._reference.all_points)))
         seen = self.measured(attempt)
         estimate = self._estimator.estimate(
-            seen.points, seen.pixels, seen.weights, attempt.estimate.state, seen.normals, attempt.prior, depths
+            seen.points, seen.pixels, seen.weights, attempt.estimate.state, seen.normals, attempt.prior, attempt.depths
         )
         return replace(attempt, estimate=estimate)
 

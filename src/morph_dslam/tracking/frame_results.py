@@ -73,6 +73,8 @@ def tracked_result(
     warnings : of where the object is.
     """
     estimate, unexplained_px, more = _with_systematic_errors(hypothesis, view, past)
+    if hypothesis.depth_unused is not None:
+        more.append(hypothesis.depth_unused)
     residuals, (n_points, n_inliers) = hypothesis.estimate.residuals[hypothesis.supporting], hypothesis.counts
     return FrameResult(
         model,

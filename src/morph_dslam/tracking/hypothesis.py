@@ -14,7 +14,7 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import Rejection, RejectionReason
+from morph_dslam.tracking.outcomes import DepthNotUsed, Rejection, RejectionReason
 from morph_dslam.tracking.outline import OutlineMeasurement
 from morph_dslam.tracking.outline_weight import MEDIAN_OF_NUMBER
 
@@ -69,6 +69,7 @@ class PoseHypothesis:
     prior : what was known of the pose from the map; None if nothing was.
     outline : of the object's rim, where it counts.
     depths : of the points that support it, where a depth camera saw them.
+    depth_unused : why there are none, where they are asked for.
     discrepancy : what the shape has beyond the model's, once it was estimated.
     n_absent : points of an outline that is alone where what is beside the object is seen in its place (`n_absent`);
         asked after a loss only.
@@ -81,6 +82,7 @@ class PoseHypothesis:
     prior: Prior | None = None
     outline: OutlineMeasurement | None = None
     depths: PointDepths | None = None
+    depth_unused: DepthNotUsed | None = None
     discrepancy: Discrepancy | None = None
     n_absent: int = 0
 

@@ -23,6 +23,7 @@ from morph_dslam.tracking.compact_loads import (
     spot_displacements,
     spot_variances,
 )
+from morph_dslam.tracking.option_values import CheckedOptions, Positive
 
 Array = NDArray[np.float64]
 #: Frames that the prior is found from.
@@ -32,7 +33,7 @@ KEPT = 0.8
 
 
 @dataclass(frozen=True)
-class LoadOptions:
+class LoadOptions(CheckedOptions):
     """How unknown loads are estimated.
 
     Attributes
@@ -40,7 +41,7 @@ class LoadOptions:
     work : scale of their elastic energy, J; None to find it, and where loads act, from the sequence.
     """
 
-    work: float | None = None
+    work: Positive | None = None
 
 
 class LoadPrior:

@@ -44,6 +44,7 @@ from morph_dslam.tracking.reference import PosedImage
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of, inverse_of_seen
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+from morph_dslam.tracking.tracker_inputs import check_pose, check_tracker
 from morph_dslam.tracking.views import KeyframeViews
 
 Array = NDArray[np.float64]
@@ -222,7 +223,7 @@ class RigTracker:
     cameras : of the rig.
     registration : pose in the rig's frame (the first camera's) and parameters in the reference frames.
     options : as of `Tracker`.
-    references : by camera, the reference frame (h, w, 3) uint8 of one instant, or made ready.
+    references : by camera, the reference frame of one instant, as `Tracker` takes it.
     in_sequence : whether the first frames to track are the reference frames or follow them.
     anchor : the map that the object is anchored in, of the first camera; None for a free object.
     seen : by camera, where (h, w) the reference frame shows the object; None for all that it covers.
@@ -250,8 +251,10 @@ class RigTracker:
         seen: Sequence[NDArray[np.bool_] | None] | None = None,
         keyframes: Sequence[KeyframeViews] | None = None,
     ) -> None:
+        check_tracker(model, registration, options)
         self.model = registration.model if registration.per_sequence else model
         self.cameras, self.options = tuple(cameras), options or TrackerOptions()
+        check_pose(self.options, registration, in_map=anchor is not None or keyframes is not None)
         if self.options.use_discrepancy:
             raise TrackingError(NO_DISCREPANCY)
         self.estimator = RigEstimator(self.model, self.cameras, self.options.estimation)
@@ -261,7 +264,7 @@ class RigTracker:
         self.trackers: list[Tracker] = []
         for number, (part, image) in enumerate(zip(self.cameras, references, strict=True)):
             grey = image.grey if isinstance(image, Image) else image
-            part.camera.check_image(grey, f"the reference frame of camera {number}")
+            part.camera.checked_picture(grey, f"the reference frame of camera {number}")
             in_camera = None if error_factors is None else part.chain(len(self.model.parameters)) @ error_factors
             try:
                 tracker = Tracker(
@@ -308,20 +311,20 @@ class RigTracker:
 
         Parameters
         ----------
-        frames : by camera, or their images (h, w, 3) alone.
+        frames : by camera, or their images alone, as `Tracker.track` takes them.
         localization : the pose in the rig's frame by the map; None for a free object.
         occluder_depths : by camera, as in `Tracker.track`.
 
         Raises
         ------
         CameraError
-            If a frame has not its camera's size.
+            If a picture or its depth is not of its camera's size, or of another type.
         """
         where = localization or CameraLocalization()
         known, results = where.pose_prior, []
         for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
             if isinstance(frame, Frame):
-                part.camera.check_image(frame.image, f"frame {frame.index} of camera {number}")
+                part.camera.checked_picture(frame.image, f"frame {frame.index} of camera {number}")
             seen = CameraLocalization(None if known is None else part.seen_pose(known))
             results.append(tracker.track(frame, seen, None if occluder_depths is None else occluder_depths[number]))
         has_moved = any(result.warning(ObjectMoved) is not None for result in results)
@@ -345,6 +348,7 @@ class RigTracker:
             n_points=sum(result.n_points for result in results),
             timings_ms=times,
             total_ms=sum(result.total_ms for result in results) + clock.total + where.milliseconds,
+            modulus_std=self.options.modulus_std,
         )
         if estimate is None:
             return result

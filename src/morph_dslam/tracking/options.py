@@ -8,6 +8,7 @@ from typing import Literal
 from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.discrepancy import DiscrepancyOptions
 from morph_dslam.tracking.estimator import EstimationOptions
+from morph_dslam.tracking.option_values import CheckedOptions, Count, NotNegative, Positive, PositiveCount, Share
 
 #: How an object's pose is found: by the map and its points, by the map alone, by its points alone, or once for the
 #: whole sequence.
@@ -21,10 +22,12 @@ NOT_IN_EQUILIBRIUM = (
 )
 NO_LOADS = "unknown loads are estimated from one camera: leave out --unknown-loads or --with"
 NO_DISCREPANCY = "the discrepancy is estimated from one camera: leave out --discrepancy or --with"
+#: Why a free object's pose cannot be fixed.
+NO_MAP = "a pose is held fixed by a map: give the object's registration in it"
 
 
 @dataclass(frozen=True)
-class TrackerOptions:
+class TrackerOptions(CheckedOptions):
     """What the tracker follows and what it demands before it believes a frame.
 
     Attributes
@@ -41,16 +44,18 @@ class TrackerOptions:
     least_anchored, anchored_share : where the map tells the pose, fewer points will do: at least this many,
         if they are this share of the points found and agree as closely as few must.
     pose : of an object in a map: "map", the camera is found in the map and the object with it; "fixed", and the
-        map's pose is taken as exact; "free", it may be anywhere; "still", camera and object stand still, so that
-        the registration's pose is that of every frame (`track` estimates it from all of them).
+        map's pose is taken as exact; "free", it may be anywhere, as one that is in no map always may; "still",
+        camera and object stand still, so that the registration's pose is that of every frame. A `Tracker` of one's
+        own keeps that pose; `track` estimates it from all frames, and once more as they come where ``live``.
     moved_share, moved_sigmas, moved_patience : an anchored object has moved when its points show it farther
         off than this share of its size, and than so many standard deviations, in so many frames on end.
     look_every : a hidden or doubted object is looked for elsewhere in every so many frames.
     use_outline : whether the object's outline counts too; it needs a background that it stands out from. An object
         with too little texture is followed by it alone, and one in a map is so unasked.
-    use_texture : whether texture counts where the outline does.
+    use_texture : whether texture counts; without it the outline does, ``use_outline`` or not.
     use_depth : whether the depth images of frames that have them count too.
-    modulus_std : standard deviation of a factor common to all moduli, a share; it counts in the reactions.
+    modulus_std : standard deviation of a factor common to all moduli, a share (0.05 for 5 %); it counts in the
+        reactions.
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
     use_discrepancy : whether to look for what the object's shape has beyond the model's.
     use_unknown_loads : whether loads that the study does not foresee are estimated too (`estimation.loads`).
@@ -63,23 +68,28 @@ class TrackerOptions:
         become reference views too, and how many are kept, the first one included.
     further_views : whether other keyframes of the map of an anchored object are reference views with the one
         that it is placed in.
+
+    Raises
+    ------
+    TrackingError
+        If a value is none of those that its type names, or outside its range.
     """
 
-    n_points: int = 350
-    inlier_sigmas: float = 6.0
-    inlier_px: tuple[float, float] = (2.0, 8.0)
-    least_inliers: int = 30
-    least_share: float = 0.3
-    few_sigma_px: float = 1.0
-    least_anchored: int = 12
-    anchored_share: float = 0.7
+    n_points: PositiveCount = 350
+    inlier_sigmas: Positive = 6.0
+    inlier_px: tuple[NotNegative, NotNegative] = (2.0, 8.0)
+    least_inliers: Count = 30
+    least_share: Share = 0.3
+    few_sigma_px: NotNegative = 1.0
+    least_anchored: Count = 12
+    anchored_share: Share = 0.7
     pose: PoseFrom = "map"
-    moved_share: float = 0.02
-    moved_sigmas: float = 5.0
-    moved_patience: int = 3
-    look_every: int = 5
-    search_above_px: float = 0.25
-    searches: int = 2
+    moved_share: NotNegative = 0.02
+    moved_sigmas: NotNegative = 5.0
+    moved_patience: PositiveCount = 3
+    look_every: PositiveCount = 5
+    search_above_px: NotNegative = 0.25
+    searches: Count = 2
     use_outline: bool = False
     use_texture: bool = True
     use_depth: bool = False
@@ -87,11 +97,16 @@ class TrackerOptions:
     use_unknown_loads: bool = False
     per_sequence: tuple[str, ...] = ()
     random_walk: tuple[tuple[str, float], ...] = ()
-    modulus_std: float = 0.0
+    modulus_std: Share = 0.0
     start: StartFrom = "previous"
     new_views: bool = True
-    max_views: int = 12
+    max_views: PositiveCount = 12
     further_views: bool = True
-    depth_sigma: float = SIGMA_AT_1M
+    depth_sigma: Positive = SIGMA_AT_1M
     discrepancy: DiscrepancyOptions = field(default_factory=DiscrepancyOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.use_texture:
+            object.__setattr__(self, "use_outline", True)

@@ -185,6 +185,27 @@ class CameraLost(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class DepthNotUsed(TrackingWarning):
+    """Depth was asked for and did not count in this frame.
+
+    Attributes
+    ----------
+    ratio : the distance of the object by the depth image over that by its points; None where no depth was measured
+        on it.
+    """
+
+    doubts_result: ClassVar[bool] = False
+    ratio: float | None = None
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        if self.ratio is None:
+            return "no depth was measured on the object"
+        return f"depth does not count: it has the object at {self.ratio:.3g} times its distance; is it in metres?"
+
+
+@dataclass(frozen=True)
 class CameraIgnored(TrackingWarning):
     """One of several cameras does not count in this frame.
 
@@ -211,12 +232,10 @@ class CameraIgnored(TrackingWarning):
 def reason_text(
     status: Status, found_by: FoundBy | None, rejection: Rejection | None, warnings: Iterable[TrackingWarning]
 ) -> str:
-    """One line for people: how the object was found or why it was not, then the warnings."""
+    """One line for people, without the status: how the object was found or why it was not, then the warnings."""
     why = "" if rejection is None else rejection.text
     if status is Status.HIDDEN:
-        first = f"hidden: {why}; its place is known from the map, its parameters are not"
-    elif status is Status.LOST:
-        first = f"lost: {why}"
+        first = f"{why}; its place is known from the map, its parameters are not"
     else:
-        first = str(found_by)
+        first = why if status is Status.LOST else str(found_by)
     return "; ".join([first, *(warning.text for warning in warnings)])

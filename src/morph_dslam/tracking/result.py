@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import ParameterError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
@@ -62,6 +63,7 @@ class FrameResult:
     made_view : whether the frame became a reference view itself.
     discrepancy : what the object's shape has beyond the model's; None where it was not estimated.
     jumps : where the surface was found to open or slip along a line, in this frame or before; as at a crack.
+    modulus_std : standard deviation of a factor common to all moduli, a share, as the tracker's options have it.
     timings_ms : by stage, milliseconds.
     total_ms : of the whole frame, milliseconds.
     """
@@ -84,8 +86,21 @@ class FrameResult:
     made_view: bool = False
     discrepancy: Discrepancy | None = None
     jumps: tuple[DisplacementJump, ...] = ()
+    modulus_std: float = 0.0
     timings_ms: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
     total_ms: float = 0.0
+
+    def __repr__(self) -> str:
+        """One line: the status, and the parameters or why there are none."""
+        if self.estimate is None:
+            return f"FrameResult({self.status}, {self.reason!r})"
+        values, deviations = self.parameters, self.parameter_std
+        found = [
+            f"{p.name}={p.display(values[p.name]):.4g}±{p.display(deviations[p.name]):.2g} {p.unit}"
+            for p in self.model.study_parameters
+        ]
+        points = f"{self.n_inliers} of {self.n_points} points agree"
+        return f"FrameResult({', '.join([self.status, self.model.name, *found, points])})"
 
     @property
     def tracked(self) -> bool:
@@ -145,7 +160,7 @@ class FrameResult:
 
         Raises
         ------
-        ValueError
+        TrackingError
             If the frame was not tracked; the same of the methods below.
         """
         value = self.model.displacement.value(self._mu)
@@ -169,47 +184,74 @@ class FrameResult:
 
         Raises
         ------
-        KeyError
+        ParameterError
             If the model has no stress there.
         """
-        places = [place] if place is not None else list(self.model.stresses)
-        if not places:
-            raise KeyError(f"the model '{self.model.name}' holds no stress")
-        return np.maximum.reduce([self.model.von_mises(self._mu, at) for at in places])
+        return np.max(self._sizes_of_stress(self._places(place)), axis=0)
 
     def near_jumps(self) -> NDArray[np.bool_]:
         """Nodes (n,) near which the surface opens or slips along a line: strain and stress do not hold there."""
         return near_jumps(self.jumps, self.model.nodes)
 
-    def von_mises_std(self, place: str) -> Array:
-        """Standard deviation (n,) of the von Mises stress of every node, pascals."""
-        return von_mises_std(self.model, self._tracked, place)
+    def von_mises_std(self, place: str | None = None) -> Array:
+        """Standard deviation (n,) of the von Mises stress of every node, pascals; as of `von_mises`.
+
+        Raises
+        ------
+        ParameterError
+            If the model has no stress there.
+        """
+        places = self._places(place)
+        deviations = np.array([von_mises_std(self.model, self._tracked, at) for at in places])
+        largest = np.argmax(self._sizes_of_stress(places), axis=0)
+        return np.take_along_axis(deviations, largest[None], axis=0)[0]
 
     def strain(self) -> Array:
         """Green-Lagrange strain (n, 6) of every node, [xx, yy, zz, yz, xz, xy], tensor shears.
 
         Raises
         ------
-        KeyError
+        ParameterError
             If the model has no strain, as those of sheets.
         """
         if self.model.strain is None:
-            raise KeyError(f"the model '{self.model.name}' holds no strain")
+            raise ParameterError(f"the model '{self.model.name}' holds no strain")
         return self.model.strain.value(self._mu)
 
-    def reactions(self, modulus_std: float = 0.0) -> dict[str, Reaction]:
+    def reactions(self, modulus_std: float | None = None) -> dict[str, Reaction]:
         """What supports exert on the object, by the name of the set; empty for a model without reactions.
 
         Parameters
         ----------
-        modulus_std : standard deviation of a factor common to all moduli, 0.05 for 5 %.
+        modulus_std : standard deviation of a factor common to all moduli, a share (0.05 for 5 %); by default that of
+            the tracker's options.
+
+        Raises
+        ------
+        TrackingError
+            If it is no share.
         """
-        return Reactions(self.model)(self._tracked, modulus_std)
+        share = self.modulus_std if modulus_std is None else modulus_std
+        if not 0.0 <= share <= 1.0:
+            raise TrackingError(f"modulus_std is {share:g}: give a share from 0 to 1, 0.05 for 5 %")
+        return Reactions(self.model)(self._tracked, share)
+
+    def _places(self, place: str | None) -> list[str]:
+        """Where the model has stress: at the place that is asked for, or at all of them."""
+        known = list(self.model.stresses)
+        if not known or place not in (None, *known):
+            what = "stress" if place is None else f"stress '{place}'"
+            raise ParameterError(f"the model '{self.model.name}' has no {what}; it has {', '.join(known) or 'none'}")
+        return known if place is None else [place]
+
+    def _sizes_of_stress(self, places: list[str]) -> Array:
+        """Von Mises stress (p, n) of every node at places."""
+        return np.array([self.model.von_mises(self._mu, at) for at in places])
 
     @property
     def _tracked(self) -> Estimate:
         if self.estimate is None:
-            raise ValueError(f"the object was not tracked in this frame ({self.reason})")
+            raise TrackingError(f"the object was not tracked in this frame: it is {self.status}, {self.reason}")
         return self.estimate
 
     @property

@@ -24,12 +24,13 @@ from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.model import save_model
 from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.model.stated_errors import force_error
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction
 from morph_dslam.tracking.result import STAGES
-from morph_dslam.tracking.run_notices import notices_of
+from morph_dslam.tracking.run_notices import flags_of, notices_of
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
 
@@ -234,19 +235,26 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
     summary["largest_forces"] = largest_forces(run)
     summary["one_over_the_sequence"] = values_over_the_sequence(run)
     notices = [*notices, *notices_of(run)]
-    summary["flags"] = [notice.text for notice in notices]
+    summary["flags"] = flags_of(notices)
     summary["notices"] = [notice.content() for notice in notices]
     return summary
 
 
 def largest_forces(run: RunResults) -> list[dict[str, Any]]:
-    """Of each support its largest force, with standard deviation and frame; the largest of them first."""
-    found = []
+    """Of each support its largest force, with standard deviation and frame; the largest of them first.
+
+    The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
+    the reduction, and where it was estimated of the discretisation too.
+    """
+    found: list[dict[str, Any]] = []
     for name, frames in run.reactions().items():
         known = [(reaction, frame) for reaction, frame in zip(frames, run.frames, strict=True) if reaction is not None]
         if known:
             largest, frame = max(((reaction.force, frame) for reaction, frame in known), key=lambda one: one[0].size)
             figures = {"on": name, "force_N": largest.size, "standard_deviation_N": largest.size_std, "frame": frame}
+            error = force_error(run.model, name)
+            if error is not None:
+                figures |= {"model_error": error[0], "model_error_of": "all" if error[1] else "reduction"}
             found.append(figures)
     return sorted(found, key=lambda figures: -float(figures["force_N"]))
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
+from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
-from morph_dslam.tracking.outcomes import ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.outcomes import DepthNotUsed, ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 
@@ -44,6 +46,14 @@ class RunWarning(StrEnum):
     SURFACE_JUMPS = (
         "from frame {first} on the surface opens or slips along a line, as at a crack, which the model does not have: "
         "by up to {where}; stress near it does not hold and is drawn grey (plots/jumps.png)"
+    )
+    DEPTH_NOT_USED = (
+        "the depth images did not count in {count} of {n_frames} frames, where they show nothing of the object or put "
+        "it elsewhere (check their scale); the reasons are in frames.csv"
+    )
+    DOUBTFUL_FIELDS = (
+        "the model misses {errors} at held-out solutions of its study: do not rely on these here, "
+        "whatever their deviations"
     )
     REFERENCE_WIDENED = (
         "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that"
@@ -104,6 +114,9 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if r.warning(ObjectMoved)]
     if moved:
         found.append(of(RunWarning.MOVED, count=len(moved), first=moved[0]))
+    without_depth = sum(result.warning(DepthNotUsed) is not None for result in run.results)
+    if without_depth:
+        found.append(of(RunWarning.DEPTH_NOT_USED, count=without_depth, n_frames=n_frames))
     failed = sum(result.warning(ModelDoesNotExplain) is not None for result in run.results)
     if failed:
         largest = float(np.nanmax(run.unexplained_px()))
@@ -115,7 +128,34 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     factor = max((result.reference_factor for result in run.results), default=1.0)
     if factor > CLEARLY_WORSE:
         found.append(of(RunWarning.REFERENCE_WIDENED, factor=factor))
+    doubtful = doubtful_errors(run.model)
+    if doubtful:
+        found.append(of(RunWarning.DOUBTFUL_FIELDS, relative=doubtful, errors=errors_in_words(doubtful)))
     return [*found, *_at_bound(run), *_unobservable(run)]
+
+
+def flags_of(notices: Sequence[Notice]) -> list[str]:
+    """Notices in words: a line for all parameters that are unobservable in frames, and one for all combinations."""
+    merged = [n for n in notices if isinstance(n, RunNotice) and n.data.get("over_the_sequence") is False]
+    said = [notice.text for notice in notices if notice not in merged]
+    alone = [notice for notice in merged if len(notice.data["parameters"]) == 1]
+    together = sorted((n for n in merged if n not in alone), key=lambda n: -n.data["count"])
+    if len(alone) > 1:
+        parts = [f"'{notice.data['parameters'][0]}' in {_frames(notice.data['count'])}" for notice in alone]
+        said.append(f"parameters are unobservable in some frames: {', '.join(parts)}")
+    elif alone:
+        said.append(alone[0].text)
+    if together:
+        first, *others = together
+        said.append(first.text)
+        if others:
+            count = sum(notice.data["count"] for notice in others)
+            said[-1] += f"; likewise {len(others)} other combination{'s' * (len(others) > 1)}, in {_frames(count)}"
+    return said
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' * (count != 1)}"
 
 
 def _at_bound(run: RunResults) -> list[RunNotice]:
@@ -144,7 +184,7 @@ def _unobservable(run: RunResults) -> list[RunNotice]:
     for part_of_run, is_last in ((estimates, False), (estimates[-1:], True)):
         for indices, (count, part) in unobservable_in_run(parameters, part_of_run).items():
             if constant.issuperset(indices) is is_last:
-                text = statement(parameters, part, "over the whole sequence" if is_last else f"in {count} frames")
-                names = [parameters[k].name for k in indices]
-                found.append(RunNotice.of(RunWarning.UNOBSERVABLE, parameters=names, count=count, statement=text))
+                text = statement(parameters, part, "over the whole sequence" if is_last else f"in {_frames(count)}")
+                data = {"parameters": [parameters[k].name for k in indices], "count": count, "statement": text}
+                found.append(RunNotice.of(RunWarning.UNOBSERVABLE, **data, over_the_sequence=is_last))
     return found

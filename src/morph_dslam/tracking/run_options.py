@@ -8,13 +8,14 @@ from pathlib import Path
 from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.landmarks import CLICK_PX
 from morph_dslam.tracking.drawing import DrawOptions
+from morph_dslam.tracking.option_values import FileOptions
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.still import CameraTerm
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectOptions:
-    """One object, by files: its model, and where it is at first (one of three).
+class ObjectOptions(FileOptions):
+    """One object, by files: its model, and where it is at first (one of three); text is taken for paths too.
 
     Attributes
     ----------

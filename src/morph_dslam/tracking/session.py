@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import SourceError, check_kind
 from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import FrameSource
 from morph_dslam.sources.live import LiveStream
@@ -21,6 +21,7 @@ from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.run_notices import RunNotice, RunWarning
 from morph_dslam.tracking.sinks import LivePicture, Sink, TrackedFrame
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+from morph_dslam.tracking.tracker_inputs import Picture
 
 Localizations = dict[str, CameraLocalization]
 
@@ -57,6 +58,7 @@ class Session:
         picture: LivePicture | None = None,
         reregistration: Mapping[str, Reregistration] | None = None,
     ) -> None:
+        check_kind(trackers, Mapping, "trackers", "a tracker of each object by its name, {'object': tracker}")
         self._objects, self._source, self._sinks = MultiObjectTracker(trackers), source, tuple(sinks)
         self._anchor, self._picture, self._reregistration = anchor, picture, reregistration or {}
         self._pipeline: LivePipeline | None = None
@@ -75,8 +77,7 @@ class Session:
         if self._anchor is None:
             return {name: tracker.locate(frames[0]) for name, tracker in self.trackers.items()}
         frame, first = frames[0], next(iter(self.trackers.values()))
-        first.camera.check_image(frame.image, f"frame {frame.index}")
-        poses, camera = self._anchor.locate(frame.image, frame.index, frame.timestamp)
+        poses, camera = self._anchor.locate(Picture.of(frame, first.camera).image, frame.index, frame.timestamp)
         why, image = str(camera.reason or ""), self._anchor.image_for(first.camera)
         return {name: CameraLocalization(poses.get(name), why, camera.total_ms, image) for name in self._anchor.names}
 

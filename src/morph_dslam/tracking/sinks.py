@@ -115,7 +115,9 @@ class LivePicture:
         image, caption = frame.image, f"frame {frame.index}"
         if self._maps is not None:
             image = np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-        missing = {name: result.reason for name, result in results.items() if result.estimate is None}
+        missing = {
+            name: f"{result.status}: {result.reason}" for name, result in results.items() if result.estimate is None
+        }
         if missing and len(results) == 1:
             caption = f"{caption}: {next(iter(missing.values()))}"
         elif missing:

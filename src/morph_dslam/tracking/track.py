@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
+from morph_dslam.io.folders import only_writer
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.model.shown_field import Shown
@@ -83,7 +84,8 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
     ------
     MorphError
         If an input cannot be used (ModelFileError, CameraError, SourceError, RegistrationError, MapError), or
-        options make no sense together or with the inputs, or a run folder holds a run already (TrackingError).
+        options make no sense together or with the inputs, or a run folder holds a run already, or another run is
+        writing to it (TrackingError).
     StreamError
         If a stream cannot be opened; or did not get all frames, after the run folders were written.
     """
@@ -201,6 +203,8 @@ class _Job:
     def __init__(self, stack: ExitStack, run: TrackOptions, source: Any, placed: list[PlacedObject]) -> None:
         self._run, self._source, self._placed = run, source, placed
         self._views = [_view_of(part, run) for part in placed]
+        for folder in run.folders:
+            stack.enter_context(only_writer(folder))
         self._folders = [
             RunFolder(folder, part.name, part.new_results(), part.camera, part.inner, run.overwrite)
             for folder, part in zip(run.folders, placed, strict=True)

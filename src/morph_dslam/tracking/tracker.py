@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError, RegistrationFailure, TrackingError
+from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
+from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
 from morph_dslam.tracking.estimator import Estimator, Prior, State
@@ -51,6 +52,7 @@ from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import error_factors_of
+from morph_dslam.tracking.tracker_inputs import Picture, check_camera, check_pose, check_tracker
 from morph_dslam.tracking.views import (
     ActiveView,
     Change,
@@ -86,14 +88,17 @@ class CameraLocalization:
 class Tracker:
     """Follows one object through the frames of one camera.
 
+    To begin anew, from another registration say, make another one. With the pose "still" it holds the registration's,
+    which `track` estimates from all frames of a recording.
+
     Parameters
     ----------
     model : the object; where the registration leaves the angle about an axis open, ``registration.model``.
     camera : its intrinsics and lens.
     registration : pose and parameters in the reference frame, and how well they are known.
     options : what is measured and what is demanded; defaults if None.
-    reference : (h, w, 3) uint8, the reference frame as recorded, or made ready; by default the keyframes of the
-        scene that the object is registered in or, without one, the first frame that is tracked.
+    reference : (h, w, 3) or (h, w) uint8, the reference frame as recorded, or made ready; by default the keyframes of
+        the scene that the object is registered in or, without one, the first frame that is tracked.
     in_sequence : whether the first frame to track is the reference frame or follows it; if not, as always after
         keyframes, the object is looked for as after a loss.
     anchor : the map that the object is anchored in; by default that of the keyframes, unless the options' pose is
@@ -114,7 +119,9 @@ class Tracker:
     RegistrationError
         If a free object shows too few corners in the reference frame, or its place in the scene has no covariance.
     TrackingError
-        If a per-sequence parameter, or one that walks, is not in the model.
+        If a per-sequence parameter, or one that walks, is not in the model, or the pose is to be fixed without a map.
+    ArgumentError
+        If model, camera, registration or options are of another kind: files are read before.
     """
 
     def __init__(
@@ -130,8 +137,12 @@ class Tracker:
         seen: NDArray[np.bool_] | None = None,
         keyframes: KeyframeViews | None = None,
     ) -> None:
+        check_tracker(model, registration, options)
+        check_camera(camera)
+        announce_compilation()
         self.model = registration.model if registration.per_sequence else model
         self.camera, self.options, self.anchor = camera, options or TrackerOptions(), anchor
+        check_pose(self.options, registration, in_map=anchor is not None or keyframes is not None)
         self.estimator = Estimator(self.model, camera, self.options.estimation)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
@@ -139,11 +150,6 @@ class Tracker:
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
         self._unfiltered = np.zeros((len(self.model.parameters) + 6,) * 2)
-        if registration.scene is not None and self.options.pose == "still":
-            raise TrackingError(
-                "an object in a mapped scene stands still in its map already, and the camera need not: take the pose "
-                "'map' or 'fixed' in place of 'still'"
-            )
         self._still: Prior | None = None
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
@@ -152,7 +158,7 @@ class Tracker:
         self._views: ViewSet | None = None
         self._jumps_before: tuple[DisplacementJump, ...] = ()
         if reference is not None:
-            self._begin(reference if isinstance(reference, Image) else self._prepared(reference))
+            self._begin(reference if isinstance(reference, Image) else self._prepared(Picture.of(reference, camera)))
 
     def track(
         self,
@@ -164,7 +170,7 @@ class Tracker:
 
         Parameters
         ----------
-        frame : as recorded, with depth where a depth camera saw it too; or its image (h, w, 3) alone.
+        frame : as recorded, with depth where a depth camera saw it too; or its image alone, (h, w, 3) or (h, w) uint8.
         localization : what `locate` found in the frame; None to find it here.
         occluder_depth : (h, w) of other objects, metres, infinite where there are none: points that they
             occlude do not count.
@@ -172,7 +178,7 @@ class Tracker:
         Raises
         ------
         CameraError
-            If the frame has not the camera's size.
+            If image or depth is not of the camera's size, or of another type.
         """
         camera = localization or self.locate(frame)
         with frame_clock(STAGES) as clock:
@@ -201,12 +207,10 @@ class Tracker:
 
         It may run in another thread than `track`, one frame ahead.
         """
-        if not isinstance(frame, Frame):
+        if not isinstance(frame, Frame) or self.anchor is None:
             return CameraLocalization()
-        self.camera.check_image(frame.image, f"frame {frame.index}")
-        if self.anchor is None:
-            return CameraLocalization()
-        poses, camera = self.anchor.locate(frame.image, frame.index, frame.timestamp)
+        image = Picture.of(frame, self.camera).image
+        poses, camera = self.anchor.locate(image, frame.index, frame.timestamp)
         image = self.anchor.image_for(self.camera)
         return CameraLocalization(next(iter(poses.values()), None), str(camera.reason or ""), camera.total_ms, image)
 
@@ -229,9 +233,8 @@ class Tracker:
     ) -> Image:
         """Undistort and normalize contrast; the first frame is the reference if none was given, a gap is a loss."""
         with stage("prepare"):
-            depth = frame.depth if isinstance(frame, Frame) and self.options.use_depth else None
-            image = ready or self._prepared(frame.image if isinstance(frame, Frame) else frame)
-            image = replace(image, depth=depth, occluder_depth=occluder_depth)
+            picture = Picture.of(frame, self.camera, self.options.use_depth)
+            image = replace(ready or self._prepared(picture), depth=picture.depth, occluder_depth=occluder_depth)
             if self._views is None:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
@@ -368,7 +371,7 @@ class Tracker:
             result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings)
             is_still = self.options.pose == "still"
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
-        return replace(result, view=self._view.number)
+        return replace(result, view=self._view.number, modulus_std=self.options.modulus_std)
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
         """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
@@ -446,8 +449,8 @@ class Tracker:
         self.options = replace(self.options, use_outline=True)
         return ReferenceView(self.estimator, images, self.options)
 
-    def _prepared(self, image: NDArray[np.uint8]) -> Image:
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    def _prepared(self, picture: Picture) -> Image:
+        grey = picture.grey
         if self._undistortion is not None:
             grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
         normalized = normalize_contrast(grey)  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, correction, size
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, correction, size, where
 
 Array = NDArray[np.float64]
 
@@ -163,7 +163,8 @@ class ArcLength:
                 linearisation = equations.linearise(x, mu)
                 response = self._response(linearisation, x, mu)
             before = largest
-        raise SolverError(f"a step of {length:.1e} along the path does not converge from {point.state.mu}")
+        begin = where(equations, point.state.mu)
+        raise SolverError(f"a step of {length:.1e} along the path does not converge from {begin}")
 
     def begin(self, start: State, sense: float = 1.0) -> PathPoint:
         """The path's first point, the parameter growing from there (``sense`` = 1) or falling (-1)."""
@@ -190,7 +191,8 @@ class ArcLength:
             corrections=count,
         )
         if self._product(point.tangent, following.tangent) < self.options.smallest_cosine:
-            raise SolverError(f"the path turns sharply, or was lost for another, beyond {point.state.mu}")
+            last = where(self.equations, point.state.mu)
+            raise SolverError(f"the path turns sharply, or was lost for another, beyond {last}")
         return following
 
     def follow(
@@ -217,7 +219,8 @@ class ArcLength:
             except SolverError as error:
                 length /= 2.0
                 if length < options.smallest:
-                    raise SolverError(f"{error}; the last parameters that converged are {point.state.mu}") from error
+                    last = where(self.equations, point.state.mu)
+                    raise SolverError(f"{error}; the last parameters that converged are {last}") from error
                 continue
             if end(following.state) >= 0.0:
                 yield self._landing(point, length, end)

@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import TOLERANCE, Equations, Linearisation, State, in_contact, size, solve
+from morph_dslam.mechanics.solvers.newton import (
+    TOLERANCE,
+    Equations,
+    Linearisation,
+    State,
+    in_contact,
+    size,
+    solve,
+    where,
+)
 
 Array = NDArray[np.float64]
 AnyState = TypeVar("AnyState")
@@ -125,8 +134,9 @@ def advance(equations: Equations, start: State, target: Array, tolerance: float 
         for number, goal in enumerate(np.atleast_2d(np.asarray(target, dtype=float))):
             path.lead_to(goal, number)
     except SolverError as error:
+        last = where(equations, path.states[-1].mu)
         raise PathError(
-            f"{error}; the last parameters that converged are {path.states[-1].mu}. A load that the body cannot "
+            f"{error}; the last parameters that converged are {last}. A load that the body cannot "
             "carry (a limit point) needs arc length, or an imposed displacement in its place",
             path.states,
         ) from error
@@ -205,6 +215,9 @@ class _LoadRamp:
         self._begin = np.where(self.free, 0.0, start)
         self._motion = equations.prescribed(full) - self._begin
 
+    def state_text(self, mu: Array) -> str:
+        return f"{100.0 * mu[0]:.4g} % of all loads at {where(self._equations, self._full)}"
+
     def prescribed(self, mu: Array) -> Array:
         return self._begin + mu[0] * self._motion
 
@@ -222,7 +235,7 @@ class _LoadRamp:
         return _Shifted(original, original.residual - (1.0 - mu[0]) * self._missing)
 
 
-def loaded_state(equations: Equations, mu: Array, start: Array | None = None) -> State:
+def loaded_state(equations: Equations, mu: Array, start: Array | None = None, tolerance: float = TOLERANCE) -> State:
     """Equilibrium at ``mu`` (d,), reached from the undeformed, stress-free body while all loads grow together.
 
     Raises SolverError if the loads cannot be carried.
@@ -231,9 +244,10 @@ def loaded_state(equations: Equations, mu: Array, start: Array | None = None) ->
     ----------
     equations : where ``applied_first`` makes others, what these have grows before the rest.
     start : (n,) where that has led already; None if nothing is applied yet.
+    tolerance : of Newton's method.
     """
     if start is None:
         first = getattr(equations, "applied_first", None)
         start = np.zeros(equations.n_dofs) if first is None else loaded_state(first(), mu).dofs
-    reached = advance(_LoadRamp(equations, mu, start), State(np.zeros(1), start), np.ones(1))[-1]
+    reached = advance(_LoadRamp(equations, mu, start), State(np.zeros(1), start), np.ones(1), tolerance)[-1]
     return State(np.array(mu, dtype=float), reached.dofs, reached.negative_pivots, reached.iterations)

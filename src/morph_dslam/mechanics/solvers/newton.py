@@ -114,6 +114,12 @@ def in_contact(equations: Equations) -> bool:
     return bool(getattr(equations, "in_contact", False))
 
 
+def where(equations: Equations, mu: Array) -> str:
+    """A state (d,) for messages: in words where the equations have a method ``state_text`` for that."""
+    text = getattr(equations, "state_text", None)
+    return str(mu) if text is None else text(mu)
+
+
 def size(equations: Equations, update: Array) -> float:
     """Largest entry of ``update`` (n,) in units of `Equations.scale`."""
     return float(np.max(np.abs(update / equations.scale)))
@@ -139,14 +145,16 @@ def solve(equations: Equations, mu: Array, start: State, tolerance: float = TOLE
         update = correction(linearisation, linearisation.residual, gap)
         largest = size(equations, update)
         if not largest < DIVERGED:
-            raise SolverError(f"Newton's method diverges at {mu}: an update of {largest:.1e} times the body's size")
+            raise SolverError(
+                f"Newton's method diverges at {where(equations, mu)}: an update of {largest:.1e} times the body's size"
+            )
         trial = _damped_step(equations, mu, x, update, gap, linearisation, tolerance)
         if trial.whole:
             trial = _follow_chords(equations, mu, trial, linearisation, tolerance)
             if min(trial.remaining, trial.length) <= tolerance:
                 return State(mu, trial.x + trial.rest, linearisation.negative_pivots, iteration)
         x = trial.x
-    raise SolverError(f"Newton's method has not converged in {MAX_ITERATIONS} iterations at {mu}")
+    raise SolverError(f"Newton's method has not converged in {MAX_ITERATIONS} iterations at {where(equations, mu)}")
 
 
 @dataclass(frozen=True)
@@ -182,7 +190,9 @@ def _damped_step(
             if remaining <= (1.0 - damping / 4.0) * allowed or (damping == 1.0 and length <= tolerance):
                 return _Trial(point, length, rest, remaining, damping == 1.0)
         damping /= 2.0
-    raise SolverError(f"Newton's method stalls at {mu}: no part of its update brings the solution nearer")
+    raise SolverError(
+        f"Newton's method stalls at {where(equations, mu)}: no part of its update brings the solution nearer"
+    )
 
 
 def _follow_chords(

@@ -1,0 +1,56 @@
+"""What a model's certificate says of the errors of its stress and forces.
+
+A displacement may be reduced well where stress and forces are not: in thin shells a small error of the shape strains
+the middle surface, which is stiff.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION, ReducedModel
+
+#: Stress and forces that the reduction misses by more than this part are not to be relied on.
+MOST = 0.1
+
+
+def doubtful_errors(model: ReducedModel) -> dict[str, float]:
+    """Errors of the reduction above `MOST`, relative, by what they are of: "von Mises stress", "forces".
+
+    Of several faces or supports it is the largest, as a part of the largest value of all of them: what is missed of a
+    support that hardly holds anything matters to nobody. Moments count by the force that has them on the body's size.
+    """
+    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    stated = model.certificate
+    stresses = [stated.get(f"stress_{place}", {}).get("von_mises", {}) for place in model.stresses]
+    reactions = {name: stated.get(REACTION + name, {}) for name in model.reactions}
+    forces = [(entry, "largest_N", 1.0) for name, entry in reactions.items() if name.startswith(FORCE)]
+    moments = [(entry, "largest_Nmm", 1e-3 / size) for name, entry in reactions.items() if name.startswith(MOMENT)]
+    kinds = {"von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stresses], "forces": [*forces, *moments]}
+    errors = {kind: _largest(entries) for kind, entries in kinds.items()}
+    return {kind: error for kind, error in errors.items() if error > MOST}
+
+
+def _largest(entries: list[tuple[dict[str, Any], str, float]]) -> float:
+    """The largest error of certificate entries; with each the key of its largest value and the factor to one unit."""
+    found = [(entry.get("relative_l2"), factor * entry.get(key, 0.0)) for entry, key, factor in entries]
+    known = [(error, value) for error, value in found if error is not None]
+    largest = max((value for _, value in known), default=0.0)
+    return max((error * value / largest for error, value in known), default=0.0) if largest else 0.0
+
+
+def errors_in_words(errors: dict[str, float]) -> str:
+    """Relative errors as "34 % of von Mises stress and 390 % of forces"."""
+    return " and ".join(f"{100.0 * error:.0f} % of {kind}" for kind, error in errors.items())
+
+
+def force_error(model: ReducedModel, support: str) -> tuple[float, bool] | None:
+    """Relative error of the force on a support, and whether the discretisation's is in it; None if none is stated."""
+    name = f"{REACTION}{FORCE}{support}"
+    reduction = model.certificate.get(name, {}).get("relative_l2")
+    if reduction is None:
+        return None
+    discretisation = model.certificate.get("discretisation", {}).get("errors", {}).get(name, {}).get("relative_l2")
+    return reduction + (discretisation or 0.0), discretisation is not None

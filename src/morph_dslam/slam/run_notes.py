@@ -1,0 +1,82 @@
+"""What a reader of a run must know of its frames, in words: lost ones, their times, depth that was left aside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.slam.result import SlamFrame, SlamStatus
+from morph_dslam.slam.rolling_shutter import LEAST_GAP_S
+from morph_dslam.slam.slam import Slam
+
+#: So many frames are named, of more their number.
+MOST_NAMED = 5
+#: No camera waits so long between frames, seconds: the times are in another unit.
+LONGEST_INTERVAL_S = 1e5
+
+
+def run_notes(slam: Slam, frames: Sequence[SlamFrame], after: Sequence[SlamFrame]) -> Iterator[str]:
+    """What a reader of a run must know of its frames.
+
+    Parameters
+    ----------
+    slam : what made the map
+    frames : what each gave
+    after : those from the first one on whose camera was found
+    """
+    n_lost = sum(frame.status is SlamStatus.LOST for frame in after)
+    if n_lost:
+        yield f"{n_lost} frames after the start were lost: frames.csv says why"
+    if slam.n_restarts:
+        yield f"{slam.n_restarts} young maps were lost for too long and given up, with their poses"
+    if frames and not after:
+        what = "the camera was found in no frame of this map" if slam.knows_map else "no map was begun"
+        yield f"{what}: {frames[-1].reason}"
+    if slam.n_depths_aside:
+        yield (
+            f"{slam.n_depths_aside} depth images are not registered to the colour and were not used: docs/sources.md "
+            "says how to register them"
+        )
+    yield from time_notes(frames, slam.camera.readout_s)
+
+
+def time_notes(frames: Sequence[SlamFrame], readout_s: float = 0.0) -> Iterator[str]:
+    """What is wrong with the times of frames, which velocities, a rolling shutter and comparisons rest on.
+
+    Parameters
+    ----------
+    frames : in the order in which they came
+    readout_s : of the camera
+    """
+    gaps = np.diff([frame.timestamp for frame in frames])
+    if not len(gaps):
+        return
+    interval = float(np.median(gaps))
+    if interval > LONGEST_INTERVAL_S:
+        yield (
+            f"the frames are {interval:.3g} s apart by their timestamps, which are seconds: divide nanoseconds by 1e9 "
+            "and microseconds by 1e6"
+        )
+        return
+    numbers = np.array([frame.index for frame in frames[1:]])
+    same, back = np.abs(gaps) < LEAST_GAP_S, gaps <= -LEAST_GAP_S
+    if same.any():
+        yield (
+            f"frames {_named(numbers[same])} have the timestamp of the frame before: write timestamps with three "
+            "decimals at least, or leave out frames that are there twice"
+        )
+    if back.any():
+        yield f"the timestamps go back at frames {_named(numbers[back])}: the order of the frames is kept"
+    if abs(readout_s) > interval > LEAST_GAP_S:
+        yield (
+            f"readout_s of the camera file, {abs(readout_s):g} s, is longer than the time between frames, "
+            f"{interval:.3g} s, which no camera does: correct one of them"
+        )
+
+
+def _named(numbers: NDArray[np.integer]) -> str:
+    """The first of them, and how many more there are."""
+    more = len(numbers) - MOST_NAMED
+    return ", ".join(str(number) for number in numbers[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,90 @@
+"""What trackers are given by scripts: arguments of the right kind, options that suit them, pictures and depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import SourceError, TrackingError, check_kind
+from morph_dslam.model import ReducedModel
+from morph_dslam.registration.registration import Registration
+from morph_dslam.sources import Frame
+from morph_dslam.tracking.options import NO_MAP, TrackerOptions
+
+
+def check_tracker(model: object, registration: object, options: object) -> None:
+    """Raise ArgumentError unless these are what a tracker of one or several cameras takes."""
+    check_kind(model, ReducedModel, "model", "the model that load_model reads from the file")
+    given = "what register_landmarks, register_board, register or load_registration returns"
+    check_kind(registration, Registration, "registration", given)
+    check_kind(options, (TrackerOptions, type(None)), "options", "TrackerOptions(...)")
+
+
+def check_camera(camera: object) -> None:
+    """Raise ArgumentError unless it is a camera."""
+    check_kind(camera, Camera, "camera", "the camera that load_camera reads from the file, or Camera(...)")
+
+
+def check_pose(options: TrackerOptions, registration: Registration, in_map: bool) -> None:
+    """Raise TrackingError unless the options' pose can be had.
+
+    Parameters
+    ----------
+    options : of the tracker.
+    registration : of the object.
+    in_map : whether the tracker is given a map, or keyframes of one, beside the registration.
+    """
+    if options.pose == "still" and registration.scene is not None:
+        raise TrackingError(
+            "an object in a mapped scene stands still in its map already, and the camera need not: take the pose "
+            "'map' or 'fixed' in place of 'still'"
+        )
+    if options.pose == "fixed" and registration.map_registration is None and not in_map:
+        raise TrackingError(f"pose='fixed': {NO_MAP}")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame, checked.
+
+    Attributes
+    ----------
+    image : (h, w, 3) or (h, w) uint8, as recorded.
+    depth : (h, w) metres; None where there is none, or it is not used.
+    """
+
+    image: NDArray[np.uint8]
+    depth: NDArray[Any] | None = None
+
+    @classmethod
+    def of(cls, frame: Frame | NDArray[np.uint8], camera: Camera, use_depth: bool = False) -> Picture:
+        """What a tracker takes of a frame, or of its image alone.
+
+        Raises
+        ------
+        CameraError
+            If the image is not one of the camera's, or the depth, if it is to be used, is not one that belongs to it.
+        SourceError
+            If a frame has no time.
+        """
+        if not isinstance(frame, Frame):
+            return cls(camera.checked_picture(frame, "the frame"))
+        where = f"frame {frame.index}"
+        if frame.timestamp is None:
+            raise SourceError(f"{where} has no timestamp: give its time in seconds")
+        depth = frame.depth if use_depth else None
+        if depth is not None:
+            camera.check_depth(depth, f"the depth of {where}")
+        return cls(camera.checked_picture(frame.image, where), depth)
+
+    @property
+    def grey(self) -> NDArray[np.uint8]:
+        """(h, w)."""
+        if self.image.ndim == 2:
+            return np.ascontiguousarray(self.image)
+        return np.asarray(cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
