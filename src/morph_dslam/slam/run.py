@@ -21,7 +21,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
 from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
-from morph_dslam.io.folders import make_run_folder
+from morph_dslam.io.folders import make_run_folder, only_writer
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.slam.frame_images import FrameImages
@@ -102,7 +102,7 @@ def run_slam(
         if not isinstance(stream, RecordedFrames):
             raise SourceError(f"{source} has no depth images: leave --depth-per-metre out")
         stream = stream.with_depth_per_metre(depth_per_metre)
-    with stream if isinstance(stream, LiveStream) else nullcontext():
+    with stream if isinstance(stream, LiveStream) else nullcontext(), only_writer(output):
         make_run_folder(output, overwrite, "trajectory.txt")
         known: Scene | Trajectory | ColmapModel | None = None
         refined: CameraEstimate | None = None

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
+from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.folders import only_writer
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.video import VideoWriter
@@ -293,8 +294,8 @@ class _Job:
             return {}
         facts = _facts(run, run.objects[number], part, folder.results)
         notices = [*part.registration.warnings, *self._again[part.name].notices]
-        if part.object.scene is not None:
-            notices += [Remark(note) for note in part.object.scene.camera_notes]
+        of_camera = camera_doubts(part.camera) if part.object.scene is None else part.object.scene.camera_notes
+        notices += [Remark(note) for note in of_camera]
         checked = self._checks[part.name].estimate() if part.name in self._checks else None
         if part.model.parameters and _leaves_residuals(folder.results):
             checked = None  # what the model leaves may be its own error as well as the camera's
