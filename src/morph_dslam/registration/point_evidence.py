@@ -58,17 +58,9 @@ class PointEvidence:
     def agreement(self) -> float:
         """How far the points where it is seen agree, -1 to 1; near 0 where there are few or they lie in one plane."""
         explained = float(self.explained.sum())
-        return self._agreeing(min(1.0, float(self.solid.sum()) / max(LEAST_SOLID * explained, 1.0)))
-
-    @property
-    def agreement_of_all(self) -> float:
-        """As ``agreement``, with points that lie in one plane: they, too, tell which of two near places is better."""
-        return self._agreeing(1.0)
-
-    def _agreeing(self, share: float) -> float:
-        """How far the points agree if such a share of those explained counts."""
-        explained, occluded = float(self.explained.sum()), VIOLATION * float(self.occluded.sum())
-        agreeing = share * float(self.closeness[self.explained].sum())
+        not_flat = min(1.0, float(self.solid.sum()) / max(LEAST_SOLID * explained, 1.0))
+        agreeing = not_flat * float(self.closeness[self.explained].sum())
+        occluded = VIOLATION * float(self.occluded.sum())
         return (agreeing - occluded) / (explained + float(self.hidden_by.sum()) + occluded + FEW)
 
 

@@ -62,10 +62,8 @@ N_FITTED, FEW_VIEWS, N_FINE, MORE_VIEWS = 30, 4, 8, 8
 #: Edges say nothing where chance puts so much of an outline on some.
 TELLING_CHANCE = 0.5
 #: No other keyframe is searched if a place has such a rank, after the first one and later, and the next place less
-#: than such a part of it. Places as good are fitted again from where each keyframe alone would have them, in so many
-#: rounds at most, while one finds a place that fits so much better.
+#: than such a part of it. Places as good are fitted again from where each keyframe alone would have them.
 ENOUGH, MUCH_WORSE = (0.5, 0.3), 0.5
-MOST_ROUNDS, CLEARLY_BETTER = 3, 1.05
 #: So many keyframes are searched for that, and all until a place has this rank.
 N_SEARCHED, SOMETHING = 3, 0.1
 #: Sizes agree within so many standard deviations, where as much as this part still speaks for the place.
@@ -122,14 +120,6 @@ class EdgeRegistration:
     def rank(self) -> float:
         """What speaks for it."""
         return _rank(self.edges, self.points)
-
-    @property
-    def fit(self) -> float:
-        """What speaks for it over places near it, where points in one plane count like others.
-
-        Which points of a small object seem to lie in one plane, their noise decides.
-        """
-        return self.edges.total * max(self.points.agreement_of_all, NO_POINTS)
 
 
 def _rank(edges: EdgeEvidence, points: PointEvidence) -> float:
@@ -263,17 +253,9 @@ class EdgeSearch:
             EdgeRegistration(place, covariance, images.evidence(edges, place), self.points_at(place))
             for place, covariance in (by_edges, (in_size, by_both[1]))
         ]
-        return max(fits, key=lambda each: each.fit)
+        return max(fits, key=lambda each: each.rank)
 
     def _again(self, found: EdgeRegistration) -> EdgeRegistration:
-        """The best place near one that was found, by rounds of `_around` while these find clearly better ones."""
-        for _ in range(MOST_ROUNDS):
-            before, found = found.fit, self._around(found)
-            if found.fit < CLEARLY_BETTER * before:
-                break
-        return found
-
-    def _around(self, found: EdgeRegistration) -> EdgeRegistration:
         """The best place near one that was found, of those begun where each keyframe alone has the object."""
         images = self._images(found.place)
 
@@ -286,7 +268,7 @@ class EdgeSearch:
             return self._fitted(start, images, NEAREST)
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
-        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.fit)
+        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.rank)
 
     def _sized(self, found: EdgeRegistration) -> EdgeRegistration:
         """A place with the size by its edges and the points in its outline together, unless they contradict each other.

@@ -14,15 +14,16 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from morph_dslam.camera import Camera
+from morph_dslam.camera import LONGEST_READOUT_S, Camera
 from morph_dslam.errors import CameraError
+from morph_dslam.geometry import cross_matrix
 from morph_dslam.io.trajectory import Trajectory
-from morph_dslam.slam.camera_views import CAMERA_STEPS, N_UNKNOWNS, NormalEquations, Views, changed
 from morph_dslam.slam.local_map import HUBER_RATIO, LEAST_HUBER_PX, MOST_HUBER_PX
 from morph_dslam.slam.pose import refine_pose
 from morph_dslam.slam.rigid_map import Followed, Indices, RigidMap
-from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
+from morph_dslam.slam.rolling_shutter import after, middle_row_pixels, row_times, velocities
 from morph_dslam.threads import one_thread_for_algebra
 
 Array = NDArray[np.float64]
@@ -35,13 +36,13 @@ CHECKED: tuple[CameraTerm, ...] = ("focal", "centre", "radial", "readout")
 COLUMNS: dict[CameraTerm, list[int]] = {
     "focal": [0], "centre": [1, 2], "radial": [3, 4], "tangential": [5, 6], "readout": [7],
 }  # fmt: skip
+N_UNKNOWNS = 8
 #: Standard deviations of the unknowns before anything is measured, the principal point's in image widths.
 #: Elements of a lens are centred so well that p1 and p2 of a calibration are seldom above two thousandths.
 PRIOR_STD = np.array([0.3, 0.1, 0.1, 0.3, 0.3, 0.002, 0.002, 0.03])
 #: Frames and points that are adjusted, spread over the recording and the most often seen; the fewest that say anything.
-#: With each frame the one before and the one after it are, from which its velocity follows.
-MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 15, 800, 8, 40
-#: Keyframes alone, and frames beside them, are adjusted where there are so many.
+MOST_FRAMES, MOST_POINTS, LEAST_FRAMES, LEAST_POINTS = 30, 800, 8, 40
+#: Keyframes alone are adjusted where there are so many.
 ENOUGH_KEYFRAMES = 10
 #: A point counts from so many frames on, a frame from so many of these points on; and the share of the frames chosen
 #: that has to count.
@@ -50,9 +51,8 @@ LEAST_VIEWS, LEAST_SEEN, LEAST_CONNECTED = 3, 20, 0.8
 ROUNDS, ITERATIONS, LEAST_GAIN = 3, 15, 1e-4
 #: Width of the Huber cost while poses and points are fitted to another camera.
 START_HUBER_PX = 20.0
-#: Standard deviation of all velocities together, a part of them: a hand shakes between frames, and timestamps are not
-#: those of the exposure. Parts of real recordings disagree by so much.
-VELOCITY_STD = 0.05
+#: Steps of the numerical derivatives: of a point, in depths, and of the camera's unknowns.
+POINT_STEP, CAMERA_STEPS = 1e-5, np.array([1e-6, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6])
 #: A departure is named if it exceeds so many standard deviations and matters: as a part of the focal length; of half
 #: the image's diagonal, for the principal point and for the lens (root mean square over the image); in pixels that
 #: the points move by, for the readout time.
@@ -116,6 +116,24 @@ class CameraEstimate:
     terms: dict[CameraTerm, TermEstimate]
 
 
+def changed(camera: Camera, unknowns: Array) -> Camera:
+    """The camera with its unknowns (8,) changed by so much."""
+    factor, distortion = float(np.exp(unknowns[0])), camera.distortion
+    if unknowns[3:7].any():
+        given = distortion or (0.0,) * 4
+        distortion = (*(value + float(change) for value, change in zip(given, unknowns[3:7], strict=False)), *given[4:])
+    readout = float(np.clip(camera.readout_s + unknowns[7], -LONGEST_READOUT_S, LONGEST_READOUT_S))
+    return replace(
+        camera,
+        fx=factor * camera.fx,
+        fy=factor * camera.fy,
+        cx=camera.cx + float(unknowns[1]),
+        cy=camera.cy + float(unknowns[2]),
+        distortion=distortion,
+        readout_s=readout,
+    )
+
+
 def terms_of(camera: Camera, terms: Sequence[CameraTerm] = TERMS) -> list[CameraTerm]:
     """Those of the terms that a camera has: a fisheye has no tangential ones."""
     return [term for term in terms if term != "tangential" or camera.lens_model == "radial-tangential"]
@@ -142,17 +160,164 @@ def _term_of(coefficient: int) -> CameraTerm:
     return "tangential" if coefficient in (2, 3) else "radial"
 
 
+@dataclass
+class _Views:
+    """Chosen frames, what they saw, and where they and the points are.
+
+    Attributes
+    ----------
+    poses : (f, 4, 4) camera_from_world.
+    twists : (f, 6) per second; zero where unknown.
+    points : (p, 3).
+    frame_idx, point_idx : (o,), each pair once.
+    recorded : (o, 2) pixels.
+    """
+
+    poses: Array
+    twists: Array
+    points: Array
+    frame_idx: Indices
+    point_idx: Indices
+    recorded: Array
+
+    def local(self) -> Array:
+        """Points (o, 3) in the axes of their cameras at the middle rows' instants."""
+        poses = self.poses[self.frame_idx]
+        return np.einsum("oij,oj->oi", poses[:, :3, :3], self.points[self.point_idx]) + poses[:, :3, 3]
+
+    def residuals(self, camera: Camera) -> Array:
+        """(o, 2) pixels; of a point that the camera cannot see far off."""
+        seconds = camera.readout_s * row_times(self.recorded[:, 1], camera)
+        seen = after(self.local(), self.twists[self.frame_idx], seconds)
+        return np.nan_to_num(camera.project_recorded(seen) - self.recorded, nan=1e3)
+
+    def moved(self, pose_steps: Array, point_steps: Array) -> _Views:
+        """With twists of the poses (f, 6) and shifts of the points (p, 3)."""
+        poses = self.poses.copy()
+        poses[:, :3] = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix() @ poses[:, :3]
+        poses[:, :3, 3] += pose_steps[:, 3:]
+        return replace(self, poses=poses, points=self.points + point_steps)
+
+    def derivatives(self, given: Camera, unknowns: Array) -> tuple[Array, Array, Array]:
+        """Of the residuals by pose twists (o, 2, 6), points (o, 2, 3) and the camera's unknowns (o, 2, 8)."""
+        camera, twists, local = changed(given, unknowns), self.twists[self.frame_idx], self.local()
+        times = row_times(self.recorded[:, 1], camera)
+        seen = after(local, twists, camera.readout_s * times)
+        steps = POINT_STEP * seen[:, 2:]
+        by_seen = np.stack(
+            [
+                (camera.project_recorded(seen + steps * axis) - camera.project_recorded(seen - steps * axis))
+                / (2.0 * steps)
+                for axis in np.eye(3)
+            ],
+            axis=2,
+        )
+        by_local = by_seen @ Rotation.from_rotvec(twists[:, :3] * (camera.readout_s * times)[:, None]).as_matrix()
+        by_pose = np.concatenate([-by_local @ cross_matrix(local), by_local], axis=2)
+        by_point = by_local @ self.poses[self.frame_idx][:, :3, :3]
+        by_camera = np.empty((len(local), 2, N_UNKNOWNS))
+        for column, step in enumerate(CAMERA_STEPS):
+            change = step * np.eye(N_UNKNOWNS)[column]
+            upper, lower = changed(given, unknowns + change), changed(given, unknowns - change)
+            by_camera[:, :, column] = (upper.project_recorded(seen) - lower.project_recorded(seen)) / (2.0 * step)
+        velocity = np.cross(twists[:, :3], seen) + twists[:, 3:]
+        by_camera[:, :, 7] = np.einsum("oij,oj->oi", by_seen, velocity) * times[:, None]
+        return np.nan_to_num(by_pose), np.nan_to_num(by_point), np.nan_to_num(by_camera)
+
+
+class _Normal:
+    """Normal equations of poses and camera after the points are eliminated.
+
+    Parameters
+    ----------
+    views : with f frames and p points
+    residuals : (o, 2) and their ``weights`` (o,).
+    derivatives : as of `_Views.derivatives`, of the camera's s free unknowns only
+    information : (s,) of the prior; ``offsets`` (s,) how far the unknowns are from it
+    damping : as a part of the diagonal
+    """
+
+    def __init__(
+        self,
+        views: _Views,
+        residuals: Array,
+        weights: Array,
+        derivatives: tuple[Array, Array, Array],
+        information: Array,
+        offsets: Array,
+        damping: float,
+    ) -> None:
+        self._views, self._residuals, self._weights, self._derivatives = views, residuals, weights, derivatives
+        (by_pose, by_point, by_camera), n_frames, n_points = derivatives, len(views.poses), len(views.points)
+        frame, point, n = views.frame_idx, views.point_idx, 6 * n_frames
+        self._n, size = n, n + by_camera.shape[2]
+        scaled = weights[:, None, None] * by_pose, weights[:, None, None] * by_point
+        blocks, poses = np.zeros((n_frames, 6, 6)), np.zeros((n_frames, 6, by_camera.shape[2]))
+        np.add.at(blocks, frame, by_pose.transpose(0, 2, 1) @ scaled[0])
+        np.add.at(poses, frame, scaled[0].transpose(0, 2, 1) @ by_camera)
+        matrix = np.zeros((size, size))
+        for f in range(n_frames):
+            matrix[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] = blocks[f]
+        matrix[:n, n:] = poses.reshape(n, -1)
+        matrix[n:, :n] = matrix[:n, n:].T
+        matrix[n:, n:] = np.einsum("o,oki,okj->ij", weights, by_camera, by_camera) + np.diag(information)
+        right = np.zeros(size)
+        np.add.at(right[:n].reshape(-1, 6), frame, -np.einsum("oki,ok->oi", scaled[0], residuals))
+        right[n:] = -np.einsum("o,oki,ok->i", weights, by_camera, residuals) - information * offsets
+        of_points, point_right = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
+        np.add.at(of_points, point, by_point.transpose(0, 2, 1) @ scaled[1])
+        np.add.at(point_right, point, -np.einsum("oki,ok->oi", scaled[1], residuals))
+        cross = np.zeros((n_frames, 6, n_points, 3))
+        cross[frame, :, point] = by_pose.transpose(0, 2, 1) @ scaled[1]
+        camera_cross = np.zeros((n_points, by_camera.shape[2], 3))
+        np.add.at(camera_cross, point, by_camera.transpose(0, 2, 1) @ scaled[1])
+        cross = np.concatenate([cross.reshape(n, -1), camera_cross.transpose(1, 0, 2).reshape(size - n, 3 * n_points)])
+        # A ridge as part of the mean keeps the scale, which nothing determines, where it is.
+        of_points += damping * of_points * np.eye(3) + 1e-9 * of_points.trace(axis1=1, axis2=2).mean() * np.eye(3)
+        self._inverse, self._cross, self._point_right = np.linalg.inv(of_points), cross, point_right
+        carried = (cross.reshape(size, n_points, 1, 3) @ self._inverse).reshape(size, -1)
+        reduced = matrix + np.diag((damping + 1e-9) * np.diag(matrix)) - carried @ cross.T
+        right = right - carried @ point_right.ravel()
+        # The first pose is held.
+        reduced[:6], reduced[:, :6], right[:6] = 0.0, 0.0, 0.0
+        reduced[range(6), range(6)] = 1.0
+        self._reduced, self._right = reduced, right
+
+    def step(self) -> tuple[Array, Array, Array]:
+        """Twists of the poses (f, 6), shifts of the points (p, 3), change of the camera's unknowns (s,)."""
+        step = np.linalg.solve(self._reduced, self._right)
+        rest = self._point_right - (self._cross.T @ step).reshape(-1, 3)
+        return step[: self._n].reshape(-1, 6), np.einsum("pij,pj->pi", self._inverse, rest), step[self._n :]
+
+    def covariance(self, information: Array, variance: float) -> Array:
+        """Of the camera's unknowns (s, s), by clusters of residuals, and by a prior of this ``information`` (s,)."""
+        views, (by_pose, by_point, by_camera) = self._views, self._derivatives
+        size, n = len(self._reduced), self._n
+        inverse = np.linalg.solve(self._reduced, np.eye(size)[:, n:])
+        of_points = self._inverse @ (self._cross.T @ inverse).reshape(len(self._inverse), 3, size - n)
+        influence = by_pose @ inverse[:n].reshape(len(views.poses), 6, size - n)[views.frame_idx]
+        influence = influence + by_camera @ inverse[n:] - by_point @ of_points[views.point_idx]
+        scores = np.einsum("o,oki,ok->oi", self._weights, influence, self._residuals)
+        result = inverse[n:].T @ np.diag(variance * information) @ inverse[n:]
+        n_residuals, n_unknowns = 2 * len(scores), 3 * len(views.points) + size
+        for groups in (views.frame_idx, views.point_idx):
+            sums = np.zeros((groups.max() + 1, size - n))
+            np.add.at(sums, groups, scores)
+            result += sums.T @ sums * n_residuals / max(n_residuals - n_unknowns, 1)
+        return result
+
+
 @dataclass(frozen=True)
 class _Solution:
     """Views, the camera's unknowns (8,), the covariance (s, s) of those that were free, and the cost, px^2."""
 
-    views: Views
+    views: _Views
     unknowns: Array
     covariance: Array
     cost: float
 
 
-def _solve(views: Views, given: Camera, unknowns: Array, free: Indices, huber_px: float | None = None) -> _Solution:
+def _solve(views: _Views, given: Camera, unknowns: Array, free: Indices, huber_px: float | None = None) -> _Solution:
     """Levenberg-Marquardt on the Huber cost, of the width that fits the errors by default, and the prior."""
     errors = np.linalg.norm(views.residuals(changed(given, unknowns)), axis=1)
     usual = float(np.median(errors))
@@ -161,17 +326,17 @@ def _solve(views: Views, given: Camera, unknowns: Array, free: Indices, huber_px
     variance = max(usual / 1.18, 0.1) ** 2
     information = variance / _prior_std(given)[free] ** 2
 
-    def cost(views: Views, unknowns: Array) -> float:
+    def cost(views: _Views, unknowns: Array) -> float:
         errors = np.linalg.norm(views.residuals(changed(given, unknowns)), axis=1)
         terms = np.where(errors < width, 0.5 * errors**2, width * (errors - 0.5 * width))
         return float(terms.sum() + 0.5 * information @ unknowns[free] ** 2)
 
-    def normal(damping: float) -> NormalEquations:
+    def normal(damping: float) -> _Normal:
         residuals = views.residuals(changed(given, unknowns))
         weights = np.minimum(1.0, width / np.maximum(np.linalg.norm(residuals, axis=1), 1e-12))
         by_pose, by_point, by_camera = views.derivatives(given, unknowns)
         derivatives = by_pose, by_point, by_camera[:, :, free]
-        return NormalEquations(views, residuals, weights, derivatives, information, unknowns[free], damping)
+        return _Normal(views, residuals, weights, derivatives, information, unknowns[free], damping)
 
     damping, before = 1e-4, cost(views, unknowns)
     for _ in range(ITERATIONS):
@@ -200,18 +365,15 @@ class _Recording:
         # What keyframes see was measured more exactly; without enough of them any frames have to do.
         exact = np.flatnonzero(sees_enough & np.isin(path.indices, list(rigid_map.seen_in_keyframes())))
         rows = exact if len(exact) >= ENOUGH_KEYFRAMES else np.flatnonzero(sees_enough)
-        self._chosen_rows, self._ids = self._chosen(rows, len(rigid_map.state))
+        self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
         # Frames far apart have few points in common: then those in the middle of the recording have to do.
-        while len(rows) > 2 * MOST_FRAMES and len(self._chosen_rows) < LEAST_CONNECTED * MOST_FRAMES:
+        while len(rows) > 2 * MOST_FRAMES and len(self._rows) < LEAST_CONNECTED * MOST_FRAMES:
             rows = rows[len(rows) // 4 : -(len(rows) // 4)]
-            self._chosen_rows, self._ids = self._chosen(rows, len(rigid_map.state))
-        together = [row for chosen in self._chosen_rows for row in (chosen - 1, chosen, chosen + 1)]
-        shown = [row for row in together if 0 <= row < len(seen) and self._shows_enough(row)]
-        self._rows = np.unique(np.array(shown, dtype=np.int64))
+            self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
         beside = np.setdiff1d(np.union1d(self._rows - 1, self._rows + 1), self._rows)
         self._beside = beside[(beside >= 0) & (beside < len(seen))]
-        self._used = np.union1d(self._rows, self._beside)
-        self._recorded = {row: camera.distort_pixels(seen[row].pixels) for row in self._used.tolist()}
+        used = np.union1d(self._rows, self._beside).tolist()
+        self._recorded = {row: camera.distort_pixels(seen[row].pixels) for row in used}
 
     def _chosen(self, rows: Indices, n_points: int) -> tuple[Indices, Indices]:
         """Some of the frames, spread, and the points that most of them saw; no frame that saw few of these."""
@@ -221,46 +383,32 @@ class _Recording:
             n_views[self._seen[row].ids] += 1
         ids = np.argsort(-n_views, kind="stable")[:MOST_POINTS]
         ids = np.sort(ids[n_views[ids] >= LEAST_VIEWS])
-        return rows[[int(np.isin(self._seen[row].ids, ids).sum()) >= LEAST_SEEN for row in rows]], ids
-
-    def _shows_enough(self, row: int) -> bool:
-        """Whether a frame sees enough of the points that are adjusted."""
-        return int(np.isin(self._seen[row].ids, self._ids).sum()) >= LEAST_SEEN
+        n_seen = np.array([np.isin(self._seen[row].ids, ids).sum() for row in rows], dtype=np.int64)
+        return rows[n_seen >= LEAST_SEEN], ids
 
     @property
     def is_enough(self) -> bool:
         """Whether there are enough frames and points."""
-        return len(self._chosen_rows) >= LEAST_FRAMES and len(self._ids) >= LEAST_POINTS
+        return len(self._rows) >= LEAST_FRAMES and len(self._ids) >= LEAST_POINTS
 
-    def _twists(self) -> Array:
-        """Velocities (f, 6) of all frames, NaN of those that are not used.
-
-        These stay where the path had them, while the others go where the adjusted points are: a velocity between both
-        would be that of the adjustment.
-        """
-        twists = np.full((len(self._times), 6), np.nan)
-        twists[self._used] = velocities(self._times[self._used], self._poses[self._used])
-        return twists
-
-    def views(self) -> Views:
+    def views(self) -> _Views:
         """The chosen frames and points as they are now."""
         local = np.full(len(self._positions), -1)
         local[self._ids] = np.arange(len(self._ids))
         chosen = [local[self._seen[row].ids] for row in self._rows]
         kept = [ids >= 0 for ids in chosen]
-        return Views(
+        return _Views(
             self._poses[self._rows],
-            np.nan_to_num(self._twists()[self._rows]),
+            np.nan_to_num(velocities(self._times, self._poses)[self._rows]),
             self._positions[self._ids],
             np.repeat(np.arange(len(chosen)), [int(rows.sum()) for rows in kept]),
             np.concatenate([ids[rows] for ids, rows in zip(chosen, kept, strict=True)]),
             np.concatenate([self._recorded[row][rows] for row, rows in zip(self._rows, kept, strict=True)]),
-            np.abs(self._rows[:, None] - self._chosen_rows).argmin(axis=1),
         )
 
-    def take_over(self, views: Views, camera: Camera) -> None:
+    def take_over(self, views: _Views, camera: Camera) -> None:
         """Take the adjusted poses and points, and place the frames beside them anew: velocities rest on these."""
-        self._positions[self._ids], before = views.points, self._twists()
+        self._positions[self._ids], before = views.points, velocities(self._times, self._poses)
         self._poses[self._rows] = views.poses
         for row in self._beside:
             known = np.isin(self._seen[row].ids, self._ids)
@@ -320,7 +468,7 @@ def _as_before(camera: Camera, terms: Sequence[CameraTerm]) -> CameraEstimate:
     return CameraEstimate(camera, estimates)
 
 
-def _start(views: Views, camera: Camera, with_lens: bool) -> _Solution:
+def _start(views: _Views, camera: Camera, with_lens: bool) -> _Solution:
     """Poses and points of the given camera; of one without lens, or with the opposite one, if these fit better.
 
     From the wrong sign of a strong lens the way down the cost does not lead to the right one.
@@ -337,8 +485,6 @@ def _estimate(camera: Camera, solution: _Solution, free: Indices, terms: Sequenc
     covariance[np.ix_(free, free)] = solution.covariance
     half_diagonal = 0.5 * float(np.hypot(camera.width, camera.height))
     found = changed(camera, solution.unknowns)
-    if "readout" in terms:
-        covariance[7, 7] += (VELOCITY_STD * found.readout_s) ** 2
     estimates: dict[CameraTerm, TermEstimate] = {}
     effects = _effects(camera, solution.views)
     for term in terms:
@@ -368,7 +514,7 @@ def _values(camera: Camera, term: CameraTerm) -> tuple[float, ...]:
     return values[term]
 
 
-def _effects(camera: Camera, views: Views) -> dict[CameraTerm, Array]:
+def _effects(camera: Camera, views: _Views) -> dict[CameraTerm, Array]:
     """By what matrix (k, unknowns of the term) a term's change moves the image: the length of what it gives counts."""
     columns, rows = np.meshgrid(np.linspace(0, camera.width - 1, 17), np.linspace(0, camera.height - 1, 13))
     rays = camera.rays(camera.undistort_pixels(np.column_stack([columns.ravel(), rows.ravel()])))
