@@ -308,22 +308,20 @@ class Camera:
         """
         is_array = isinstance(image, np.ndarray)
         if not is_array or image.dtype != np.uint8 or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
-            given = f"an array {image.shape} of {image.dtype}" if is_array else f"of type {type(image).__name__}"
             raise CameraError(
-                f"{where} is {given}: give its picture as an array of uint8, {(self.height, self.width, 3)} in blue, "
-                f"green, red, or {(self.height, self.width)} in grey"
+                f"{where} is {_kind(image)}: give its picture as an array of uint8, {(self.height, self.width, 3)} in "
+                f"blue, green, red, or {(self.height, self.width)} in grey"
             )
         self.check_image(image, where)
         return image[:, :, 0] if image.shape[2:] == (1,) else image
 
     def check_depth(self, depth: NDArray, where: str) -> None:
         """Raise CameraError, whose message begins with ``where``, unless it is a depth image of the camera's size."""
-        size, is_array = (self.height, self.width), isinstance(depth, np.ndarray)
-        if not is_array or depth.dtype.kind != "f" or depth.shape != size:
-            given = f"an array {depth.shape} of {depth.dtype}" if is_array else f"of type {type(depth).__name__}"
+        size = (self.height, self.width)
+        if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or depth.shape != size:
             raise CameraError(
-                f"{where} is {given}: give metres as float32, {size} as the picture that it belongs to, NaN where "
-                "nothing was measured"
+                f"{where} is {_kind(depth)}: give metres as float32, {size} as the picture that it belongs to, NaN "
+                "where nothing was measured"
             )
 
     def check_image(self, image: NDArray, where: str) -> None:
@@ -396,3 +394,10 @@ class StereoCamera:
         y = np.cross(z, x)
         y /= np.linalg.norm(y)
         return np.stack([x, y, np.cross(x, y)])
+
+
+def _kind(value: object) -> str:
+    """What was given where an array was wanted, for messages."""
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape} of {value.dtype}"
+    return f"of type {type(value).__name__}"
