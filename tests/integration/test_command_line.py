@@ -3,6 +3,7 @@
 import json
 import re
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -93,6 +94,17 @@ def test_the_frame_log_has_a_line_for_each_frame(sequence):
         for key, name in (("camera_from_object", "camera_from_object"), ("largest_von_mises", "largest_von_mises")):
             np.testing.assert_array_equal([row[key] for row in rows], file[name][()])
         np.testing.assert_array_equal([list(row["parameters"].values()) for row in rows], file["parameters"][()])
+
+
+def test_a_recording_that_never_shows_the_object_ends_as_an_error_and_keeps_its_run(sequence, tmp_path, refused):
+    (tmp_path / "grey").mkdir()
+    for frame in range(3):
+        cv2.imwrite(str(tmp_path / "grey" / f"{frame}.png"), np.full((360, 480, 3), 120, np.uint8))
+    options = {"frames": tmp_path / "grey", "output": tmp_path / "run"}
+    message = refused(*track_command(sequence, "--outline", "--no-video", **options))
+    assert f"was lost in every frame, for the reasons in {tmp_path}/run/frames.csv" in message
+    with h5py.File(tmp_path / "run" / "result.h5") as file:
+        assert file["status"].asstr()[()].tolist() == ["lost"] * 3
 
 
 @pytest.fixture

@@ -77,14 +77,21 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def track_and_print(options: TrackOptions) -> None:
-    """Track, and print the figures of each run folder; where nothing was tracked, no empty folder is left behind."""
+    """Track, and print the figures of each run folder; where nothing was tracked, no empty folder is left behind.
+
+    Raises
+    ------
+    MorphError
+        As `track`; TrackingError if each object was lost in all frames, once the run folders are complete.
+    """
     from morph_dslam import track
 
     absent = [folder for folder in options.folders if not folder.exists()]
-    written = []
+    written: dict[Path, dict[str, Any]] = {}
 
     def tell(folder: Path, summary: dict[str, Any]) -> None:
-        written.extend([folder] if summary else [])
+        if summary:
+            written[folder] = summary
         print_summary(folder, summary)
 
     try:
@@ -97,6 +104,12 @@ def track_and_print(options: TrackOptions) -> None:
         for folder in reversed(absent):
             with suppress(OSError):  # it was not made, or holds something
                 folder.rmdir()
+    if written and all(summary["n_lost"] == summary["n_frames"] for summary in written.values()):
+        reasons = " and ".join(str(folder / "frames.csv") for folder in written)
+        raise TrackingError(
+            f"the object was lost in every frame, for the reasons in {reasons}: check where it starts, the camera "
+            "file, and that the recording shows it"
+        )
 
 
 def _complete(arguments: argparse.Namespace) -> None:
