@@ -30,6 +30,7 @@ from morph_dslam.tracking.relocalization import LEAST_MATCHES, state_from_matche
 from morph_dslam.tracking.state import BoundPoints, State
 from tests.support.bent_sheet import LENGTH, WIDTH
 from tests.support.real_data import real_data
+from tests.support.rendered_board import turned_tags
 from tests.support.rendered_sequence import CAMERA, mean_error, write_landmarks, write_recording
 from tests.support.staged_scenes import SCENES, aside
 
@@ -96,21 +97,6 @@ def test_a_board_tells_its_pose_within_half_a_millimetre(tmp_path, text):
     assert 1e3 * np.linalg.norm(off, axis=1).max() < 1.0
     away = found.camera_from_board.translation - BOARD_POSE.translation
     assert (np.abs(away) < 5.0 * np.sqrt(np.diag(found.covariance)[3:])).all()
-
-
-def turned_tags(board: FiducialBoard) -> FiducialBoard:
-    """The board with each of its tags printed turned by 180 degrees, as AprilTag and ViSP have them."""
-
-    class Turned(FiducialBoard):
-        def image(self, pixels_per_metre):
-            whole = board.image(pixels_per_metre)
-            side, pitch = (round(length * pixels_per_metre) for length in (0.03, board.pitch))
-            for row, column in np.ndindex(board.description.rows, board.description.columns):
-                place = np.s_[row * pitch : row * pitch + side, column * pitch : column * pitch + side]
-                whole[place] = whole[place][::-1, ::-1].copy()
-            return whole
-
-    return Turned(board.description)
 
 
 def test_tags_turned_as_apriltag_prints_them_are_read_too(tmp_path):

@@ -5,16 +5,20 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from morph_dslam.calibration.board import Board, View, Views, find_corners, select_by_coverage
+from morph_dslam.calibration.board import Board, find_corners
 from morph_dslam.calibration.calibrate import Calibration, calibrate
 from morph_dslam.calibration.solve import solve_intrinsics
+from morph_dslam.calibration.views import View, Views, select_by_coverage
 from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import CameraError
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.registration.board import load_board
 from tests.support.real_data import real_data
-from tests.support.rendered_board import board_image, board_poses
+from tests.support.rendered_board import board_image, board_poses, fiducial_image, turned_tags
 
 BOARD = Board(9, 6, 0.025)
 CAMERA = Camera(640, 480, 541.0, 538.5, 327.3, 236.1, (-0.27, 0.09, 8e-4, -5e-4))
@@ -37,7 +41,9 @@ def write_all(folder, images):
 
 def exact_views(camera, poses, board=BOARD):
     """Views with the exact corners."""
-    return [View(f"view {k}", camera.project_recorded(p.apply(board.points))) for k, p in enumerate(poses)]
+    return [
+        View(f"view {k}", board.points, camera.project_recorded(p.apply(board.points))) for k, p in enumerate(poses)
+    ]
 
 
 def test_corners_are_where_the_board_is(pictures):
@@ -106,7 +112,7 @@ def test_the_stated_deviation_is_that_of_repeated_calibrations(camera, lens):
     exact = exact_views(camera, board_poses(camera, board, 12, 40.0, seed=5), board)
     rng, found, stated = np.random.default_rng(0), [], []
     for _ in range(16):
-        noisy = [View(v.name, v.corners + rng.normal(scale=0.1, size=v.corners.shape)) for v in exact]
+        noisy = [View(v.name, v.points, v.corners + rng.normal(scale=0.1, size=v.corners.shape)) for v in exact]
         solution = solve_intrinsics(noisy, board, (640, 480), lens)
         found.append(solution.camera.intrinsics[[0, 2, 3]])
         stated.append([solution.focal_deviation[0], *solution.centre_deviation])
@@ -121,7 +127,7 @@ def test_a_bent_board_is_solved_for():
     bent = BOARD.points.copy()
     bent[:, 2] = 1e-3 * (1.0 - ((bent[:, 0] - 0.1) / 0.1) ** 2)
     poses = board_poses(CAMERA, BOARD, 15, 40.0, seed=6)
-    views = [View(f"{k}", CAMERA.project_recorded(pose.apply(bent))) for k, pose in enumerate(poses)]
+    views = [View(f"{k}", BOARD.points, CAMERA.project_recorded(pose.apply(bent))) for k, pose in enumerate(poses)]
     solution = solve_intrinsics(views, BOARD, (640, 480))
     assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=5e-4)
     assert solution.flatness > 0.5e-3
@@ -132,7 +138,7 @@ def test_a_bent_board_is_solved_for():
 def test_views_that_fit_no_camera_are_left_out():
     views = exact_views(CAMERA, board_poses(CAMERA, BOARD, 12, 40.0, seed=7))
     moved = views[3].corners + np.random.default_rng(0).normal(scale=3.0, size=(54, 2))
-    views[3] = View("moving", moved)
+    views[3] = View("moving", BOARD.points, moved)
     solution = solve_intrinsics(views, BOARD, (640, 480))
     assert solution.left_out == ("moving",)
     assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
@@ -143,7 +149,7 @@ def test_pictures_of_two_cameras_are_told(shift, is_told):
     poses, rng = board_poses(CAMERA, BOARD, 16, 40.0, seed=9), np.random.default_rng(0)
     other = replace(CAMERA, cx=CAMERA.cx + shift)
     views = [
-        View(f"{name}{k:02d}.jpg", view.corners + rng.normal(scale=0.1, size=view.corners.shape))
+        View(f"{name}{k:02d}.jpg", view.points, view.corners + rng.normal(scale=0.1, size=view.corners.shape))
         for name, camera, part in (("left", CAMERA, poses[:8]), ("right", other, poses[8:]))
         for k, view in enumerate(exact_views(camera, part))
     ]
@@ -212,12 +218,56 @@ def test_selection_prefers_views_that_differ():
     rng = np.random.default_rng(0)
     rest = board_poses(CAMERA, BOARD, 1, 5.0, seed=9)[0]
     corners = CAMERA.project_recorded(rest.apply(BOARD.points))
-    same = [corners + rng.normal(scale=0.2, size=corners.shape) for _ in range(20)]
-    others = [view.corners for view in exact_views(CAMERA, board_poses(CAMERA, BOARD, 4, 40.0, seed=10))]
-    chosen = select_by_coverage([*same[:10], *others, *same[10:]], 9, (640, 480), most=5)
+    same = [View("", BOARD.points, corners + rng.normal(scale=0.2, size=corners.shape)) for _ in range(20)]
+    others = exact_views(CAMERA, board_poses(CAMERA, BOARD, 4, 40.0, seed=10))
+    chosen = select_by_coverage([*same[:10], *others, *same[10:]], (640, 480), most=5)
     assert set(range(10, 14)) <= set(chosen)
     assert len(chosen) == 5
-    assert select_by_coverage(others, 9, (640, 480), most=30) == [0, 1, 2, 3]
+    assert select_by_coverage(others, (640, 480), most=30) == [0, 1, 2, 3]
+
+
+CHARUCO = {"kind": "charuco", "dictionary": "5x5_100", "columns": 8, "rows": 6, "square_mm": 28, "marker_mm": 20}
+TAGS = {"kind": "grid", "dictionary": "apriltag_36h11", "columns": 5, "rows": 4, "marker_mm": 36, "gap_mm": 10}
+
+
+def partial_poses(camera, size, n_views, seed):
+    """Poses of a print of ``size`` metres that is about as large as the image, tilted by up to 40 degrees."""
+    rng, poses, middle = np.random.default_rng(seed), [], np.array([0.5 * size[0], 0.5 * size[1], 0.0])
+    for _ in range(n_views):
+        turn = Rotation.from_rotvec(np.deg2rad([*rng.uniform(-40, 40, 2), rng.uniform(-30, 30)])).as_matrix()
+        depth = camera.fx * size[0] / camera.width * rng.uniform(0.75, 1.2)
+        centre = np.array([*rng.uniform(-0.25, 0.25, 2) * depth, depth])
+        poses.append(RigidTransform(turn, centre - turn @ middle))
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("described", "printed"),
+    [(CHARUCO, lambda board: board), (TAGS, lambda board: board), (TAGS, turned_tags)],
+    ids=["charuco", "OpenCV's tags", "AprilTag's tags"],
+)
+def test_a_board_of_markers_may_be_seen_in_part(tmp_path, capsys, described, printed):
+    (tmp_path / "board.toml").write_text("\n".join(f"{key} = {value!r}" for key, value in described.items()))
+    board = printed(load_board(tmp_path / "board.toml"))
+    poses = partial_poses(CAMERA, board.size, 14, seed=3)
+    images = [fiducial_image(CAMERA, board, pose, seed) for seed, pose in enumerate(poses)]
+    folder = write_all(tmp_path / "images", images)
+    command = ["calibrate", str(folder), "--board", str(tmp_path / "board.toml"), "-o", str(tmp_path / "cam.yaml")]
+    assert cli.main(command) == 0
+    assert "views=14/14" in capsys.readouterr().out
+    found = load_camera(tmp_path / "cam.yaml")
+    # 0.5 pixels; straight lines along the edges of markers, which this lens bends, put fx 1.6 pixels too low.
+    np.testing.assert_allclose(found.intrinsics, CAMERA.intrinsics, atol=0.5)
+
+
+def test_a_board_of_markers_that_is_not_there_or_described_twice(pictures, tmp_path, refused):
+    (tmp_path / "board.toml").write_text("\n".join(f"{key} = {value!r}" for key, value in CHARUCO.items()))
+    folder = write_all(tmp_path / "images", pictures[0][:3])
+    command = ["calibrate", folder, "--board", tmp_path / "board.toml", "-o", tmp_path / "cam.yaml"]
+    message = refused(*command)
+    assert "no board of 8x6 squares with markers of 5x5_100 was found in 3 images: compare the dictionary" in message
+    assert "--square is for a checkerboard" in refused(*command, "--square", "28 mm")
+    assert "say how large a square of the checkerboard is" in refused(*command[:3], "8x6", *command[4:])
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

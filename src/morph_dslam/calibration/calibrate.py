@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from morph_dslam.calibration.board import Board, View, Views, collect_views
+from morph_dslam.calibration.board import CalibrationBoard
 from morph_dslam.calibration.solve import FEWEST_VIEWS, Solution, solve_intrinsics
+from morph_dslam.calibration.views import View, Views, collect_views
 from morph_dslam.camera import LensModel
 from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_doubts import camera_doubts
@@ -36,7 +37,7 @@ def plot_calibration(path: Path, solution: Solution) -> None:
 def _draw_image(axes: Axes, solution: Solution) -> None:
     camera = solution.camera
     corners = np.concatenate([view.corners for view in solution.views])
-    residuals = solution.residuals.reshape(-1, 2)
+    residuals = np.concatenate(solution.residuals)
     axes.plot(*corners.T, ".", color="#8fb3d9", markersize=3.0, zorder=1)
     axes.quiver(
         *corners.T, *residuals.T, angles="xy", scale_units="xy", scale=1.0 / MAGNIFIED, width=1.5e-3, color="#b4530a"
@@ -51,7 +52,7 @@ def _draw_image(axes: Axes, solution: Solution) -> None:
 
 
 def _draw_scatter(axes: Axes, solution: Solution) -> None:
-    residuals = solution.residuals.reshape(-1, 2)
+    residuals = np.concatenate(solution.residuals)
     axes.plot(*residuals.T, ".", color="#b4530a", markersize=2.0)
     reach = 1.05 * max(float(np.abs(residuals).max()), 1e-3)
     axes.set_xlim(-reach, reach)
@@ -83,7 +84,7 @@ BENT = 0.005
 MOST_APART = 0.02
 
 
-def _of_two_cameras(solution: Solution, board: Board) -> Iterator[str]:
+def _of_two_cameras(solution: Solution, board: CalibrationBoard) -> Iterator[str]:
     """What to tell if views whose names begin differently, left01.jpg and right01.jpg say, give different cameras."""
     groups: dict[str, list[View]] = {}
     for view in solution.views:
@@ -108,7 +109,7 @@ class Calibration:
 
     solution: Solution
     found: Views
-    board: Board
+    board: CalibrationBoard
     picture: Path | None = None
 
     @property
@@ -135,8 +136,7 @@ class Calibration:
             )
         yield from camera_doubts(solution.camera)
         yield from _of_two_cameras(solution, self.board)
-        length = self.board.square * max(self.board.columns, self.board.rows)
-        if solution.flatness > BENT * length:
+        if solution.flatness is not None and solution.flatness > BENT * self.board.length:
             yield f"the board is bent: its corners are up to {1e3 * solution.flatness:.1f} mm off its plane"
 
     def table(self) -> str:
@@ -162,7 +162,7 @@ class Calibration:
 
 def calibrate(
     sources: Sequence[str | Path],
-    board: Board,
+    board: CalibrationBoard,
     output: str | Path | None = None,
     lens_model: LensModel = "radial-tangential",
 ) -> Calibration:

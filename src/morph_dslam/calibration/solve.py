@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.calibration.board import Board, View
+from morph_dslam.calibration.board import CalibrationBoard
+from morph_dslam.calibration.views import View
 from morph_dslam.camera import Camera, LensModel
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp
@@ -43,32 +44,33 @@ class Solution:
     Attributes
     ----------
     camera : as solved for
-    views : (v) those used
+    views : (v) those used, with the board as its maker says
     left_out : names of views that do not fit
-    board_points : (n, 3) the corners as solved for, metres
     camera_from_board : (v) poses
-    residuals : (v, n, 2) found minus projected corners, pixels
+    residuals : (v) arrays (n, 2) of found minus projected corners, pixels
     focal_deviation : standard deviation of fx and fy, pixels
     centre_deviation : of cx and cy, pixels
+    flatness : largest distance of a corner, as solved for, from the plane that fits the board best, metres; None where
+        the board is taken as flat
     """
 
     camera: Camera
     views: tuple[View, ...]
     left_out: tuple[str, ...]
-    board_points: Array
     camera_from_board: tuple[RigidTransform, ...]
-    residuals: Array
+    residuals: tuple[Array, ...]
     focal_deviation: tuple[float, float]
     centre_deviation: tuple[float, float]
+    flatness: float | None = None
 
     @property
     def view_rms(self) -> Array:
         """Root mean square residual (v,) of each view, pixels."""
-        return np.sqrt((self.residuals**2).sum(axis=2).mean(axis=1))
+        return np.array([np.sqrt((of_view**2).sum(axis=1).mean()) for of_view in self.residuals])
 
     @property
     def rms(self) -> float:
-        """Root mean square residual over all corners, pixels."""
+        """Root mean square residual of all views, pixels."""
         return float(np.sqrt((self.view_rms**2).mean()))
 
     @property
@@ -76,15 +78,9 @@ class Solution:
         """Angle (v,) between the board's normal and the optical axis in each view, radians."""
         return np.array([np.arccos(min(abs(pose.rotation[2, 2]), 1.0)) for pose in self.camera_from_board])
 
-    @property
-    def flatness(self) -> float:
-        """Largest distance of a corner from the plane that fits the board best, metres."""
-        centred = self.board_points - self.board_points.mean(axis=0)
-        return float(np.abs(centred @ np.linalg.svd(centred)[2][2]).max())
-
 
 def solve_intrinsics(
-    views: Sequence[View], board: Board, size: tuple[int, int], lens_model: LensModel = "radial-tangential"
+    views: Sequence[View], board: CalibrationBoard, size: tuple[int, int], lens_model: LensModel = "radial-tangential"
 ) -> Solution:
     """Calibrate from views of the board, leaving out those that do not fit the others.
 
@@ -98,7 +94,7 @@ def solve_intrinsics(
             raise CameraError(
                 f"the board was found in {len(kept)} images only{without}; {FEWEST_VIEWS} are needed, 15 are good"
             )
-        solution = solve(kept, board, size)
+        solution = solve(kept, size)
         rms = solution.view_rms
         bad = (rms > OUTLIER_RATIO * np.median(rms)) & (rms > HARMLESS)
         if not bad.any():
@@ -106,8 +102,8 @@ def solve_intrinsics(
         left_out += [view.name for view, is_bad in zip(kept, bad, strict=True) if is_bad]
         kept = [view for view, is_bad in zip(kept, bad, strict=True) if not is_bad]
     _check_determined(solution)
-    if lens_model != "fisheye" and board.has_one_orientation and len(kept) >= FEWEST_FOR_SHAPE:
-        solution = _solve_radial_tangential(kept, board, size, with_shape=True)
+    if lens_model != "fisheye" and board.held_corner >= 0 and len(kept) >= FEWEST_FOR_SHAPE:
+        solution = _solve_radial_tangential(kept, size, board.held_corner)
     return replace(solution, left_out=tuple(left_out))
 
 
@@ -128,30 +124,31 @@ def _check_determined(solution: Solution) -> None:
         )
 
 
-def _solve_radial_tangential(
-    views: Sequence[View], board: Board, size: tuple[int, int], with_shape: bool = False
-) -> Solution:
-    # Three corners hold the place and scale of a board that is solved for: both ends of the first row, and the last.
-    held = board.columns - 1 if with_shape else -1
-    objects = [board.points.astype(np.float32)] * len(views)
-    corners = [view.corners.astype(np.float32) for view in views]
+def _solve_radial_tangential(views: Sequence[View], size: tuple[int, int], held_corner: int = -1) -> Solution:
+    """By OpenCV, with the board's shape too where a corner is held."""
     found = cv2.calibrateCameraROExtended(
-        objects,
-        corners,
+        [view.points.astype(np.float32) for view in views],
+        [view.corners.astype(np.float32) for view in views],
         size,
-        held,
+        held_corner,
         np.eye(3),
         np.zeros(5),
         criteria=_CRITERIA,  # type: ignore[call-overload]
     )
     _, matrix, coefficients, rotations, translations, points, deviations = found[:7]
-    camera = _camera(size, matrix, coefficients, "radial-tangential")
-    points = np.asarray(points, dtype=float).reshape(-1, 3) if with_shape else board.points
-    return _solution(camera, views, points, rotations, translations, np.ravel(deviations)[:4])
+    camera, of_camera = _camera(size, matrix, coefficients, "radial-tangential"), np.ravel(deviations)[:4]
+    if held_corner < 0:
+        return _solution(camera, views, rotations, translations, of_camera)
+    shape = np.asarray(points, dtype=float).reshape(-1, 3)
+    centred = shape - shape.mean(axis=0)
+    flatness = float(np.abs(centred @ np.linalg.svd(centred)[2][2]).max())
+    shaped = [replace(view, points=shape) for view in views]
+    solved = _solution(camera, shaped, rotations, translations, of_camera)
+    return replace(solved, views=tuple(views), flatness=flatness)
 
 
-def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -> Solution:
-    objects = [board.points.reshape(1, -1, 3)] * len(views)
+def _solve_fisheye(views: Sequence[View], size: tuple[int, int]) -> Solution:
+    objects = [view.points.reshape(1, -1, 3) for view in views]
     corners = [np.ascontiguousarray(view.corners).reshape(1, -1, 2) for view in views]
     # Since version 5 OpenCV keeps these flags with those of other cameras.
     known: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2
@@ -166,8 +163,8 @@ def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -
             camera = _camera(size, matrix, coefficients, "fisheye")
         except (cv2.error, CameraError):
             continue  # no pose of the board is seen through a lens of this angle, or only a mirrored one
-        deviations = _fisheye_deviations(views, board, matrix, coefficients, rotations, translations)
-        fits.append(_solution(camera, views, board.points, rotations, translations, deviations))
+        deviations = _fisheye_deviations(views, matrix, coefficients, rotations, translations)
+        fits.append(_solution(camera, views, rotations, translations, deviations))
         if fits[-1].rms < HARMLESS:
             break
     if not fits:
@@ -177,21 +174,20 @@ def _solve_fisheye(views: Sequence[View], board: Board, size: tuple[int, int]) -
 
 def _fisheye_deviations(
     views: Sequence[View],
-    board: Board,
     matrix: NDArray,
     coefficients: NDArray,
     rotations: Sequence[NDArray],
     translations: Sequence[NDArray],
 ) -> Array:
     """Standard deviations (4,) of fx, fy, cx, cy, pixels, from the curvature of the sum of squares at its least."""
-    n, squares = 2 * len(board.points), 0.0
-    slopes = np.zeros((n * len(views), 8 + 6 * len(views)))
+    ends, squares = 2 * np.cumsum([0, *(len(view.points) for view in views)]), 0.0
+    slopes = np.zeros((ends[-1], 8 + 6 * len(views)))
     for k, (view, rotation, translation) in enumerate(zip(views, rotations, translations, strict=True)):
-        points = board.points.reshape(1, -1, 3)
+        points, rows = view.points.reshape(1, -1, 3), slice(ends[k], ends[k + 1])
         pixels, by = cv2.fisheye.projectPoints(points, rotation, translation, matrix, coefficients)
         # The columns are f, c, the distortion, the rotation, the translation, and the skew.
-        slopes[n * k : n * (k + 1), :8] = by[:, :8]
-        slopes[n * k : n * (k + 1), 8 + 6 * k : 14 + 6 * k] = by[:, 8:14]
+        slopes[rows, :8] = by[:, :8]
+        slopes[rows, 8 + 6 * k : 14 + 6 * k] = by[:, 8:14]
         squares += float(((pixels.reshape(-1, 2) - view.corners) ** 2).sum())
     # Columns differ by orders of magnitude; scaled, the pseudo-inverse drops only what is undetermined.
     scale = np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
@@ -208,7 +204,6 @@ def _camera(size: tuple[int, int], matrix: NDArray, coefficients: NDArray, lens_
 def _solution(
     camera: Camera,
     views: Sequence[View],
-    points: Array,
     rotations: Sequence[NDArray],
     translations: Sequence[NDArray],
     deviations: NDArray,
@@ -218,7 +213,7 @@ def _solution(
         RigidTransform(rotation_exp(np.ravel(r).astype(float)), np.ravel(t).astype(float))
         for r, t in zip(rotations, translations, strict=True)
     )
-    projected = [camera.project_recorded(pose.apply(points)) for pose in poses]
-    residuals = np.array([view.corners for view in views]) - np.array(projected)
+    placed = [pose.apply(view.points) for view, pose in zip(views, poses, strict=True)]
+    residuals = tuple(view.corners - camera.project_recorded(at) for view, at in zip(views, placed, strict=True))
     fx, fy, cx, cy = deviations.tolist()
-    return Solution(camera, tuple(views), (), points, poses, residuals, (fx, fy), (cx, cy))
+    return Solution(camera, tuple(views), (), poses, residuals, (fx, fy), (cx, cy))

@@ -1,11 +1,19 @@
 """`morph calibrate`: a camera's intrinsics and distortion."""
 
+from __future__ import annotations
+
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from morph_dslam.cli.arguments import add_output
+from morph_dslam.errors import CameraError
 
-HELP = "find a camera's intrinsics and distortion from pictures of a checkerboard"
+if TYPE_CHECKING:
+    from morph_dslam import Board
+    from morph_dslam.extend.registration import FiducialBoard
+
+HELP = "find a camera's intrinsics and distortion from pictures of a board"
 KEPT = "nothing was written"
 
 
@@ -18,9 +26,15 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="images, a folder of images, or a video (docs/cameras.md)",
     )
     command.add_argument(
-        "--board", required=True, metavar="CORNERS", help="inner corners, where four squares meet, each way: 9x6"
+        "--board",
+        required=True,
+        metavar="BOARD",
+        help="inner corners of a checkerboard, where four squares meet, each way: 9x6; or the board file of a board of "
+        "markers (docs/registration-aids.md), of which pictures may show parts",
     )
-    command.add_argument("--square", required=True, metavar="LENGTH", help="side of one square with its unit: '25 mm'")
+    command.add_argument(
+        "--square", metavar="LENGTH", help="side of one square of a checkerboard with its unit: '25 mm'"
+    )
     command.add_argument(
         "--lens",
         choices=("radial-tangential", "fisheye"),
@@ -32,12 +46,25 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Calibrate and print how well the corners fit."""
-    from morph_dslam import Board, calibrate
+    from morph_dslam import calibrate
 
-    board = Board.parse(arguments.board, arguments.square)
-    calibration = calibrate(arguments.source, board, arguments.output, arguments.lens)
+    calibration = calibrate(arguments.source, _board(arguments), arguments.output, arguments.lens)
     print(calibration.table())
     for remark in calibration.remarks():
         print(f"note: {remark}")
     print(f"wrote {arguments.output} and {calibration.picture}")
     print(calibration.line())
+
+
+def _board(arguments: argparse.Namespace) -> Board | FiducialBoard:
+    """The board of a file, or the checkerboard that ``--board`` and ``--square`` describe."""
+    from morph_dslam import Board
+    from morph_dslam.extend.registration import load_board
+
+    if Path(arguments.board).suffix == ".toml":
+        if arguments.square is not None:
+            raise CameraError(f"--square is for a checkerboard: {arguments.board} says its sizes itself")
+        return load_board(Path(arguments.board))
+    if arguments.square is None:
+        raise CameraError("say how large a square of the checkerboard is, --square '25 mm', or give a board file")
+    return Board.parse(arguments.board, arguments.square)

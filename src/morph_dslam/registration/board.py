@@ -29,34 +29,33 @@ N_PLACES, INNER, REACH_SHARE, REACHES_PX = 15, (0.12, 0.88), 0.08, (1.5, 4.0)
 ITERATIONS = 3
 
 
-def refined_corners(grey: NDArray[np.uint8], markers: Array) -> Array:
+def refined_corners(grey: NDArray[np.uint8], markers: Array, curved: bool = False) -> Array:
     """Corners (m, 4, 2) of dark markers on white, in an image (h, w), from those of a detector.
 
-    A corner-shaped window is drawn inwards by blur; the steepest places of straight edges are not.
+    A corner-shaped window is drawn inwards by blur; the steepest places of edges are not. ``curved`` says that a lens
+    bends straight edges: they are parabolas then.
     """
     smooth = grey.astype(np.float32)
     corners = markers.astype(np.float64)
     for _ in range(ITERATIONS):
-        corners = _from_edges(smooth, corners)
+        corners = _from_edges(smooth, corners, 2 if curved else 1)
     # A detector's corner is never further off than that: an edge that went elsewhere was not the marker's.
     kept = np.linalg.norm(corners - markers, axis=2, keepdims=True) < REACHES_PX[1]
     return np.where(kept, corners, markers)
 
 
-def _from_edges(image: NDArray[np.float32], corners: Array) -> Array:
+def _from_edges(image: NDArray[np.float32], corners: Array, degree: int) -> Array:
+    """The corners (m, 4, 2) where curves of a degree through the edges' steepest places meet."""
     following = np.roll(corners, -1, axis=1)
     along = following - corners
     lengths = np.linalg.norm(along, axis=2, keepdims=True)
-    along = along / np.maximum(lengths, 1e-9)
-    outwards = np.stack([along[..., 1], -along[..., 0]], axis=2)
+    outwards = np.stack([along[..., 1], -along[..., 0]], axis=2) / np.maximum(lengths, 1e-9)
     centre = corners.mean(axis=1, keepdims=True)
     outwards *= np.sign(np.sum(outwards * (corners - centre), axis=2, keepdims=True))
-    places = (
-        corners[:, :, None] + np.linspace(*INNER, N_PLACES)[None, None, :, None] * (following - corners)[:, :, None]
-    )
-    steps = np.linspace(-1.0, 1.0, 17)
+    shares = np.linspace(*INNER, N_PLACES)
+    places = corners[:, :, None] + shares[None, None, :, None] * along[:, :, None]
     reach = np.clip(REACH_SHARE * lengths, *REACHES_PX)  # (m, 4, 1)
-    offsets = steps * reach  # (m, 4, s)
+    offsets = np.linspace(-1.0, 1.0, 17) * reach  # (m, 4, s)
     sampled = places[:, :, :, None] + offsets[:, :, None, :, None] * outwards[:, :, None, None]
     flat = sampled.reshape(len(corners) * 4, -1, 2).astype(np.float32)
     values = cv2.remap(image, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -64,18 +63,25 @@ def _from_edges(image: NDArray[np.float32], corners: Array) -> Array:
     rise = np.maximum(np.diff(values, axis=3), 0.0) + 1e-6
     between = 0.5 * (offsets[:, :, 1:] + offsets[:, :, :-1])[:, :, None]
     shifts = np.sum(rise * between, axis=3) / rise.sum(axis=3)
-    edges = places + shifts[..., None] * outwards[:, :, None]
-    middle = edges.mean(axis=2)
-    _, _, axes = np.linalg.svd(edges - middle[:, :, None], full_matrices=False)
-    normals = axes[:, :, 1]
-    # A corner is where the edge before it meets the edge after it.
-    before_normals, before_middle = np.roll(normals, 1, axis=1), np.roll(middle, 1, axis=1)
-    rows = np.stack([before_normals, normals], axis=2)
-    right = np.stack([np.sum(before_normals * before_middle, axis=2), np.sum(normals * middle, axis=2)], axis=2)
-    straight = np.abs(np.linalg.det(rows)) > 0.05
-    rows = np.where(straight[..., None, None], rows, np.eye(2))
-    right = np.where(straight[..., None], right, corners)
-    return np.linalg.solve(rows, right[..., None])[..., 0]
+    # How far outwards the edge is, as a polynomial of the share of its length: (m, 4, degree + 1), constant first.
+    curve = shifts @ np.linalg.pinv(np.vander(shares, degree + 1, increasing=True)).T
+    # The edge after a corner at its beginning, and the edge before it at its end: points and tangents.
+    powers = np.arange(degree + 1)
+    after = corners + curve[..., :1] * outwards, along + curve[..., 1:2] * outwards
+    end = following + curve.sum(axis=2, keepdims=True) * outwards
+    before = (np.roll(part, 1, axis=1) for part in (end, along + (curve @ powers)[..., None] * outwards))
+    return _where_lines_meet(after, tuple(before), corners)
+
+
+def _where_lines_meet(first: tuple[Array, Array], second: tuple[Array, Array], instead: Array) -> Array:
+    """Where lines (m, 4, 2), each a point and a direction, meet; ``instead`` where they are nearly parallel."""
+    points, directions = (np.stack(pair, axis=2) for pair in zip(first, second, strict=True))
+    normals = np.stack([directions[..., 1], -directions[..., 0]], axis=-1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+    right = np.sum(normals * points, axis=-1)
+    cross = np.abs(np.linalg.det(normals)) > 0.05
+    normals = np.where(cross[..., None, None], normals, np.eye(2))
+    return np.linalg.solve(normals, np.where(cross[..., None], right, instead)[..., None])[..., 0]
 
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -85,6 +91,8 @@ DICTIONARIES = tuple(
 )
 #: Fewer corners are not believed: one marker has four.
 FEWEST_CORNERS = 4
+#: A marker's side, pixels, from which on it is read well.
+FEWEST_PIXELS = 20
 DOTS_PER_INCH = 300
 #: A side of a print is at most so long, metres: beyond it the unit was mistaken.
 LARGEST_SIDE = 10.0
@@ -162,6 +170,30 @@ class FiducialBoard:
         return RigidTransform(turn, 1e-3 * np.array(place.position_mm))
 
     @property
+    def name(self) -> str:
+        """What it is."""
+        d, cells = self.description, "markers" if self.description.kind == "grid" else "squares"
+        return f"board of {d.columns}x{d.rows} {cells} with markers of {d.dictionary.lower()}"
+
+    @property
+    def advice(self) -> str:
+        """What to look at where it is found nowhere."""
+        return (
+            "compare the dictionary, columns and rows of the board file with the print, and show the board sharp, "
+            f"with markers of at least {FEWEST_PIXELS} pixels"
+        )
+
+    @property
+    def length(self) -> float:
+        """Its longer side, metres."""
+        return max(self.size)
+
+    @property
+    def held_corner(self) -> int:
+        """-1: pictures show different parts of it."""
+        return -1
+
+    @property
     def pitch(self) -> float:
         """From one marker or square to the next, metres."""
         d = self.description
@@ -184,8 +216,11 @@ class FiducialBoard:
             return aruco.GridBoard(size, marker, self.pitch - marker, dictionary)
         return aruco.CharucoBoard(size, self.pitch, marker, dictionary)
 
-    def find(self, grey: NDArray[np.uint8]) -> tuple[Array, Array]:
-        """Corners of the board (k, 3), board frame, metres, and their pixels (k, 2) in an image (h, w)."""
+    def find(self, grey: NDArray[np.uint8], distorted: bool = False) -> tuple[Array, Array]:
+        """Corners of the board (k, 3), board frame, metres, and their pixels (k, 2) in an image (h, w).
+
+        ``distorted`` says that the image is as the lens made it.
+        """
         aruco, board = cv2.aruco, self._board  # type: ignore[attr-defined]
         if self.description.kind == "charuco":
             corners, ids, _, _ = aruco.CharucoDetector(board).detectBoard(grey)
@@ -196,7 +231,7 @@ class FiducialBoard:
             return np.empty((0, 3)), np.empty((0, 2))
         if self.description.kind == "grid":
             found = np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
-            corners = [marker[None].astype(np.float32) for marker in refined_corners(grey, found)]
+            corners = [marker[None].astype(np.float32) for marker in refined_corners(grey, found, distorted)]
         points, pixels = board.matchImagePoints(corners, ids)
         if points is None or not len(points):
             return np.empty((0, 3)), np.empty((0, 2))
