@@ -9,6 +9,7 @@ from morph_dslam.cli.app import main
 from morph_dslam.errors import RegistrationError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.camera_files import save_rig
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.sources.live import PacedRecording
@@ -18,7 +19,6 @@ from morph_dslam.tracking.occlusion import MultiObjectTracker
 from morph_dslam.tracking.session import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.camchain import write_camchain
 from tests.support.rendered_sequence import (
     CAMERA,
     UPRIGHT,
@@ -294,7 +294,7 @@ def rig_recording_of_sheet(model, tmp_path_factory):
     pairs = {number: images(films, time) for number, time in enumerate([0.0, *RIG_TIMES[:4]])}
     for k, name in enumerate(("front", "aside")):
         write_recording(folder, {number: pair[k] for number, pair in pairs.items()}, model, name=name)
-    write_camchain(folder / "camchain.yaml", RIG)
+    save_rig(folder / "camchain.yaml", [(part.camera, part.camera_from_rig) for part in RIG])
     write_landmarks(folder / "landmarks.csv", model, sheet_state(0.0), FRONT.camera, count=24)
     return folder
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, cross_matrix, rotation_exp
-from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.camera_files import save_camera, save_rig
 from morph_dslam.model import ReducedModel, load_model, save_model
 from morph_dslam.render.environment import Motion, StaticScene, plan_motion
 from morph_dslam.render.rasteriser import rasterise
@@ -26,7 +26,6 @@ from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.multi_camera import RigCamera
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.camchain import write_camchain
 from tests.support.rendered_anchored import write_registration
 from tests.support.staged_scenes import bending_wedge
 
@@ -164,7 +163,7 @@ def make_rig_recording(folder: Path) -> None:
         _write_film(folder, name, parts, camera, frames)
     truth = _truth(parts)
     save_camera(folder / "camera.yaml", _CAMERA)
-    write_camchain(folder / "camchain.yaml", RIG)
+    save_rig(folder / "camchain.yaml", [(part.camera, part.camera_from_rig) for part in RIG])
     _scan(folder, models, truth)
     _save_truth(folder, truth)
 
@@ -208,7 +207,7 @@ def make_mirrored_recording(left: Path, folder: Path) -> None:
         for frame in range(count):
             path = folder / "both" / f"{first + frame:06}.png"
             path.symlink_to(folder / source / f"{frame:06}.png")
-    write_camchain(folder / "camchain_mirrored.yaml", MIRRORED_RIG)
+    save_rig(folder / "camchain_mirrored.yaml", [(part.camera, part.camera_from_rig) for part in MIRRORED_RIG])
     scan, there = _truth(films[_SCAN_AND_BEND]), _truth(films[_LEFT])
     _save_truth(
         folder,

@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.model import SeparatedField, save_model
+from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.mesh import register_mesh
-from morph_dslam.registration.messages import Ambiguity, Ambiguous, AngleOpen, AtBound
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, AngleOpen, AtBound, TurnArbitrary
 from morph_dslam.registration.register import run_registration, without_points_on
 from morph_dslam.registration.registration import (
     Axis,
@@ -68,6 +69,27 @@ def test_the_stated_deviations_are_those_of_the_middle_of_the_object():
     # A keyframe's own covariance is one of a turn about the object's origin and a shift of it.
     own = np.diag([1e-4, 1e-4, 1e-4, 4e-6, 4e-6, 4e-6])
     assert stated(np.zeros(7), own) == pytest.approx((np.sqrt(4e-6 + 1e-4 * centre @ centre), 0.01))
+
+
+def test_a_rigid_body_of_revolution_is_placed_up_to_its_turn(tmp_path):
+    """A cup from a drawing: whether its nodes fall on themselves does not matter, and its turn is no parameter."""
+    tube = bent_tube()
+    nodes = tube.nodes + np.random.default_rng(0).normal(scale=1e-4, size=tube.nodes.shape)
+    constant = ParameterFunctions(np.empty(0), np.empty(0), np.zeros((1, 0), dtype=np.int64), np.ones((1, 1)))
+    still = SeparatedField(np.zeros((1, len(nodes), 3)), constant)
+    cup = ReducedModel("cup", nodes, tube.triangles, (), still)
+    pose = RigidTransform(rotation_exp(np.array([0.3, -0.4, 0.2])), np.array([0.05, -0.02, 0.6]))
+    # Known to 0.01 rad but for the turn about the axis, which is not known at all.
+    covariance = block_diag(0.0, np.diag([1e-4, 1e-4, 4.0]), np.zeros((3, 3)))
+    placed = MapRegistration(SimilarityTransform.identity(), nodes.mean(axis=0), covariance)
+    axis = Axis(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    saved = registration_in_map(cup, placed, [KeyframePose(7, pose)], {}, (), axis)
+    assert (saved.per_sequence, saved.warnings) == ((), (TurnArbitrary(),))
+    assert saved.pose_deviations() == pytest.approx((0.0, 0.01), abs=1e-6)
+    saved.save(tmp_path / "registration.json")
+    read = load_registration(tmp_path / "registration.json", cup)
+    assert read.warnings == (TurnArbitrary(),)
+    assert read.model.parameters == ()
 
 
 def test_a_registration_in_a_map_is_read_as_it_was_saved(tmp_path):

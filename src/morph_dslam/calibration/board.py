@@ -45,6 +45,11 @@ class CalibrationBoard(Protocol):
         """
         ...
 
+    @property
+    def has_one_orientation(self) -> bool:
+        """Whether it cannot be mistaken for itself turned by half a turn."""
+        ...
+
     def find(self, grey: NDArray[np.uint8], distorted: bool = False) -> tuple[Array, Array]:
         """Corners of the board (k, 3), board frame, metres, and their pixels (k, 2) in an image (h, w); k may be 0.
 

@@ -178,7 +178,7 @@ def calibrate(
     Raises CameraError if the board is found in too few images, images differ in size, the views do not determine the
     focal length, or the camera file cannot be written. Raises SourceError if an image or a video cannot be read.
     """
-    picture = None if output is None else _picture_path(Path(output))
+    picture = None if output is None else check_output(Path(output))
     found = collect_views([Path(source) for source in sources], board, ignored=picture)
     calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board, picture)
     if output is not None and picture is not None:
@@ -190,7 +190,7 @@ def calibrate(
     return calibration
 
 
-def _picture_path(output: Path) -> Path:
+def check_output(output: Path) -> Path:
     """Where the picture of a calibration goes, by its camera file, which is checked."""
     if output.suffix not in (".yaml", ".yml"):
         raise CameraError(f"cannot write {output}: a camera file has the ending .yaml")

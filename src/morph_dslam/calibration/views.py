@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +42,12 @@ class View:
     points: Array
     corners: Array
 
+    @property
+    def number(self) -> int | None:
+        """Of the frame: the last number in its name, 12 of right_012.png."""
+        digits = re.findall(r"\d+", Path(self.name).stem)
+        return int(digits[-1]) if digits else None
+
 
 @dataclass(frozen=True)
 class Views:
@@ -60,8 +67,16 @@ def collect_views(sources: Sequence[Path], board: CalibrationBoard, ignored: Pat
     Raises CameraError if the board is found nowhere, or the images differ in size. Raises SourceError if an image or a
     video cannot be read.
     """
+    found = find_views(sources, board, ignored)
+    return found if _image_files(sources) else best_views(found)
+
+
+def find_views(
+    sources: Sequence[Path], board: CalibrationBoard, ignored: Path | None = None, step: int | None = None
+) -> Views:
+    """All views in images, or in every ``step``-th frame of a recording; the rest as `collect_views`."""
     files = [path for path in _image_files(sources) if ignored is None or path.resolve() != ignored.resolve()]
-    images, total = (_read(files), len(files)) if files else _sampled(sources)
+    images, total = (_read(files), len(files)) if files else _sampled(sources[0], step)
     views, size, n_searched = [], None, 0
     for name, image in tqdm(images, total=total, desc="searching the board", unit="image", disable=None):
         height, width = image.shape[:2]
@@ -72,15 +87,18 @@ def collect_views(sources: Sequence[Path], board: CalibrationBoard, ignored: Pat
                 "calibrate with images of one size, that of the video to be tracked"
             )
         n_searched += 1
-        points, corners = board.find(
-            np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8), distorted=True
-        )
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        points, corners = board.find(grey, distorted=True)
         if _determine_a_plane(points):
             views.append(View(name, points, corners))
     if not views or size is None:
         raise CameraError(f"no {board.name} was found in {n_searched} images: {board.advice}")
-    views = _in_their_order(views, board)
-    return Views(tuple(views if files else [views[i] for i in select_by_coverage(views, size)]), size, n_searched)
+    return Views(tuple(_in_their_order(views, board)), size, n_searched)
+
+
+def best_views(found: Views) -> Views:
+    """The views among many that `select_by_coverage` chooses."""
+    return replace(found, views=tuple(found.views[i] for i in select_by_coverage(found.views, found.size)))
 
 
 def _determine_a_plane(points: Array) -> bool:
@@ -124,10 +142,15 @@ def _read(files: Iterable[Path]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
         yield path.name, read_image(path, "calibration image")
 
 
-def _sampled(sources: Sequence[Path]) -> tuple[Iterator[tuple[str, NDArray[np.uint8]]], int]:
+def sampling_step(sources: Sequence[Path]) -> int:
+    """Of a recording, every so many frames are searched; 1 of images."""
+    return 1 if _image_files(sources) else -(-len(open_source(sources[0])) // MOST_SEARCHED)
+
+
+def _sampled(recording: Path, step: int | None) -> tuple[Iterator[tuple[str, NDArray[np.uint8]]], int]:
     """Frames evenly spread over a recording, and how many."""
-    source = open_source(sources[0])
-    step = -(-len(source) // MOST_SEARCHED)
+    source = open_source(recording)
+    step = step or -(-len(source) // MOST_SEARCHED)
     frames = ((f"frame {frame.index}", frame.image) for count, frame in enumerate(source) if count % step == 0)
     return frames, -(-len(source) // step)
 

@@ -1,4 +1,4 @@
-"""`morph calibrate`: a camera's intrinsics and distortion."""
+"""`morph calibrate`: intrinsics and distortion of a camera, or of those of a rig, and where these are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morph_dslam.cli.arguments import add_output
+from morph_dslam.cli.arguments import add_output, add_repeated
 from morph_dslam.errors import CameraError
 
 if TYPE_CHECKING:
@@ -41,6 +41,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         default="radial-tangential",
         help="lens model: fisheye for views of more than about 120 degrees",
     )
+    add_repeated(
+        command,
+        "--with",
+        "what the next camera of a rig saw, with the same frame numbers: a folder of images or a video; the file to "
+        "write is then a Kalibr camchain",
+        "SOURCE",
+        Path,
+    )
     add_output(command, "CAMERA", "camera file to write (.yaml)")
 
 
@@ -48,12 +56,33 @@ def run(arguments: argparse.Namespace) -> None:
     """Calibrate and print how well the corners fit."""
     from morph_dslam import calibrate
 
+    others = vars(arguments)["with"]  # a keyword of the language
+    if others:
+        _run_rig(arguments, [arguments.source, *([source] for source in others)])
+        return
     calibration = calibrate(arguments.source, _board(arguments), arguments.output, arguments.lens)
     print(calibration.table())
     for remark in calibration.remarks():
         print(f"note: {remark}")
     print(f"wrote {arguments.output} and {calibration.picture}")
     print(calibration.line())
+
+
+def _run_rig(arguments: argparse.Namespace, sources: list[list[Path]]) -> None:
+    """Calibrate several cameras, and print how well each is known and where it is."""
+    from morph_dslam import calibrate_rig
+
+    rig = calibrate_rig(sources, _board(arguments), arguments.output, arguments.lens)
+    for number, calibration in enumerate(rig.cameras):
+        print(f"cam{number}: {calibration.line()}")
+        for remark in calibration.remarks():
+            print(f"note: cam{number}: {remark}")
+    print(rig.table())
+    for remark in rig.remarks():
+        print(f"note: {remark}")
+    pictures = ", ".join(str(calibration.picture) for calibration in rig.cameras)
+    print(f"wrote {arguments.output} and {pictures}")
+    print(rig.line())
 
 
 def _board(arguments: argparse.Namespace) -> Board | FiducialBoard:

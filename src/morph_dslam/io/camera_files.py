@@ -7,7 +7,7 @@ programs are recognised by the keys that only they have, and translated to these
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -158,6 +158,24 @@ def save_camera(path: Path, camera: Camera) -> None:
     if camera.readout_s:
         content["readout_s"] = camera.readout_s
     path.write_text(yaml.safe_dump(content, sort_keys=False))
+
+
+def save_rig(path: Path, cameras: Sequence[tuple[Camera, RigidTransform]]) -> None:
+    """Write the Kalibr camchain of cameras, each with camera_from_cam0, that `load_rig` reads."""
+    chain, before = {}, RigidTransform.identity()
+    for number, (camera, pose) in enumerate(cameras):
+        lens = "equidistant" if camera.lens_model == "fisheye" else "radtan"
+        entry = {
+            "camera_model": "pinhole",
+            "intrinsics": camera.intrinsics.tolist(),
+            "distortion_model": lens if camera.distortion else "none",
+            "distortion_coeffs": list(camera.distortion),
+            "resolution": [camera.width, camera.height],
+        }
+        if number:
+            entry["T_cn_cnm1"] = (pose @ before.inverse).matrix.tolist()
+        chain[f"cam{number}"], before = entry, pose
+    path.write_text(yaml.safe_dump(chain, sort_keys=False))
 
 
 def _read_yaml(path: Path) -> object:

@@ -194,6 +194,11 @@ class FiducialBoard:
         return -1
 
     @property
+    def has_one_orientation(self) -> bool:
+        """Always: each marker differs."""
+        return True
+
+    @property
     def pitch(self) -> float:
         """From one marker or square to the next, metres."""
         d = self.description

@@ -306,6 +306,13 @@ class AngleOpen(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class TurnArbitrary(RegistrationWarning):
+    """A rigid object can be turned about its axis without a difference."""
+
+    template: ClassVar[str] = "the object is the same all around its axis: the pose's turn about it is arbitrary"
+
+
+@dataclass(frozen=True)
 class TooLittleTexture(RegistrationWarning):
     """The keyframes could not be compared on the object, so that they did not refine its place."""
 

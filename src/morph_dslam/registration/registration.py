@@ -18,7 +18,7 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.notices import Notice
-from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsewhere, read_warning
+from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsewhere, TurnArbitrary, read_warning
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.state import Prior, State, pose_increment
 
@@ -254,7 +254,12 @@ class Registration:
             return None
         arm = pose.rotation @ self.model.positions(self.state.parameters).mean(axis=0)
         of_centre = np.hstack([-cross_matrix(arm), np.eye(3)])
-        worst = (np.linalg.eigvalsh(part)[-1] for part in (of_centre @ covariance @ of_centre.T, covariance[:3, :3]))
+        turn = np.eye(3)
+        if self.axis is not None:
+            along = pose.rotation @ self.axis.direction
+            turn -= np.outer(along, along)
+        parts = of_centre @ covariance @ of_centre.T, turn @ covariance[:3, :3] @ turn
+        worst = (np.linalg.eigvalsh(part)[-1] for part in parts)
         place, angle = (float(np.sqrt(max(value, 0.0))) for value in worst)
         return place, angle
 
@@ -342,9 +347,13 @@ def registration_in_map(
     last = max(keyframes, key=lambda view: view.frame)
     open_angles: tuple[str, ...] = ()
     if axis is not None:
-        model = with_revolution_angle(model, axis.direction, precision=np.float32)
-        open_angles = (model.parameters[-1].name,)
-        warnings = [*(w for w in warnings if not isinstance(w, AngleOpen)), AngleOpen(*open_angles)]
+        warnings = [w for w in warnings if not isinstance(w, AngleOpen | TurnArbitrary)]
+        if model.parameters:
+            model = with_revolution_angle(model, axis.direction, precision=np.float32)
+            open_angles = (model.parameters[-1].name,)
+            warnings.append(AngleOpen(*open_angles))
+        else:  # nothing deforms it that could come from a side
+            warnings.append(TurnArbitrary())
     of_pose = map_registration.pose_covariance(last.pose) if last.covariance is None else last.covariance
     return Registration(
         model,
