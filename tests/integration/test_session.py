@@ -1,5 +1,6 @@
 """Several objects, several cameras, and what goes with them, on rendered sheets with known states."""
 
+import h5py
 import numpy as np
 import pytest
 
@@ -319,6 +320,29 @@ def test_the_command_tracks_with_both_cameras(model, rig_recording_of_sheet, tmp
         *with_both_cameras(folder, tmp_path / "again", "--with", folder / "aside")
     )
     assert "camchain.yaml#cam1" in refused(*with_both_cameras(folder, tmp_path / "again", camera="camchain.yaml#cam1"))
+
+
+def test_cameras_that_do_not_agree_are_named_and_one_recording_twice_is_refused(
+    rig_recording_of_sheet, tmp_path, capsys, refused
+):
+    """The second camera is said to be turned by 30 degrees about its axis."""
+    folder, said, unexplained = rig_recording_of_sheet, {}, {}
+    off = RigidTransform(rotation_exp(np.array([0.0, 0.0, np.pi / 6])), np.zeros(3)) @ ASIDE.camera_from_rig
+    save_rig(folder / "moved.yaml", [(FRONT.camera, RigidTransform.identity()), (ASIDE.camera, off)])
+    for camera in ("camchain", "moved"):
+        arguments = with_both_cameras(folder, tmp_path / camera, "--no-video", camera=f"{camera}.yaml#cam0")
+        assert run_command(arguments) == 0
+        said[camera] = capsys.readouterr().out
+        with h5py.File(tmp_path / camera / "result.h5") as file:
+            unexplained[camera] = np.nanmax(file["unexplained_px"][()])
+    assert "the cameras do not agree with each other" not in said["camchain"]
+    assert "of 5 frames the cameras do not agree with each other: up to" in said["moved"]
+    assert unexplained["camchain"] < 0.1
+    assert unexplained["moved"] > 0.5
+    twice = [
+        word if word != folder / "aside" else folder / "front" for word in with_both_cameras(folder, tmp_path / "r")
+    ]
+    assert "front is given for two cameras" in refused(*twice)
 
 
 def test_frames_of_different_numbers_do_not_go_together(rig_recording_of_sheet):

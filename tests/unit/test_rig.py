@@ -17,7 +17,7 @@ from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
-from morph_dslam.tracking.multi_camera import RigCamera, RigEstimator, RigReference
+from morph_dslam.tracking.multi_camera import RigCamera, RigErrors, RigEstimator
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.sequence_filter import SequenceFilter
@@ -236,7 +236,7 @@ def estimated(model, pictures):
 def check_prediction(model, pictures):
     found, seen, trackers = estimated(model, pictures)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = RigReference(trackers, RIG).added(plain, seen, None).covariance
+    stated = RigErrors(trackers, RIG).added(plain, seen, None, [0.0] * len(RIG)).covariance
     pose, true = found.state.camera_from_object, LATER.camera_from_object
     turn = pose.rotation @ true.rotation.T
     away = np.concatenate(
@@ -266,4 +266,8 @@ def test_of_two_pictures_each_is_off_in_its_own_way_by_the_same_cause(model, ste
 
 def test_nothing_is_added_where_nothing_is_known(model):
     found, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
-    assert RigReference(trackers, RIG).added(found, seen, None) is found
+    errors = RigErrors(trackers, RIG)
+    left = errors.unexplained(found, seen)
+    assert max(rest.px for rest in left) < 1e-6
+    stated = errors.added(found, seen, None, [rest.px for rest in left])
+    np.testing.assert_allclose(stated.covariance, found.covariance, atol=1e-12)

@@ -32,7 +32,9 @@ from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions
 from morph_dslam.tracking.outcomes import (
     CameraIgnored,
     CameraLost,
+    CamerasDisagree,
     FoundBy,
+    ModelDoesNotExplain,
     ObjectMoved,
     PoseSource,
     Rejection,
@@ -42,7 +44,7 @@ from morph_dslam.tracking.outcomes import (
 )
 from morph_dslam.tracking.reference import PosedImage
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of, inverse_of_seen
+from morph_dslam.tracking.systematic_errors import SystematicErrors, Unexplained, error_factors_of, inverse_of_seen
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from morph_dslam.tracking.tracker_inputs import check_pose, check_tracker
 from morph_dslam.tracking.views import KeyframeViews
@@ -157,13 +159,37 @@ class RigEstimator:
         return LinearCost.joined(costs, measured.correlation)
 
 
-class RigReference:
-    """Adds to covariances what the reference state is off by.
+@dataclass(frozen=True)
+class _View:
+    """What one camera measured, about the common estimate.
+
+    Attributes
+    ----------
+    chain : (d + 6, d + 6) from increments in the rig's frame to those in the camera's.
+    systematic : errors of the camera's points.
+    estimate : in the camera's frame, with the residuals of its texture's points only.
+    weights : (p,) of these, zero for those that do not count.
+    """
+
+    chain: Array
+    systematic: SystematicErrors
+    estimate: Estimate
+    weights: Array
+
+    @property
+    def unexplained(self) -> Unexplained:
+        """What the common estimate leaves of the camera's residuals."""
+        return self.systematic.unexplained(self.estimate, self.weights > 0.0)
+
+
+class RigErrors:
+    """Adds to covariances what the reference state, and the model, are off by.
 
     As for one camera (`systematic_errors`), an error e of the reference state enters each estimate through the
     points that were bound by it. Each camera sees e as C e, with C its chain from increments in the rig's frame
     to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In other
-    reference images of the undeformed object the same error factors make another e each.
+    reference images of the undeformed object the same error factors make another e each. What neighbouring points
+    of a camera's image have in common in the residuals enters as for one camera, each camera's by itself.
 
     Parameters
     ----------
@@ -183,26 +209,51 @@ class RigReference:
         ]
         self._counts = [len(tracker.reference.points) for tracker in trackers]
 
-    def added(self, estimate: Estimate, measured: RigObservations, prior: Prior | None) -> Estimate:
-        """The estimate, a state in the rig's frame, with a covariance that holds the reference's error."""
-        if not self._is_known:
-            return estimate
-        size = len(self._scale)
-        hessian, first = np.zeros((size, size)), 0
-        pushes = []
+    def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
+        """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
+
+        It has several causes: the model's error, the rig's calibration, and images that are not of one instant.
+        """
+        return [view.unexplained for view in self._views(estimate, measured)]
+
+    def added(
+        self, estimate: Estimate, measured: RigObservations, prior: Prior | None, common_px: Sequence[float]
+    ) -> Estimate:
+        """The estimate with a covariance that holds both errors.
+
+        Parameters
+        ----------
+        estimate : a state in the rig's frame.
+        measured : what it was made from.
+        prior : what was known of the frame's pose.
+        common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
+        """
+        views = self._views(estimate, measured)
+        products = [view.systematic.products(view.estimate, view.weights) for view in views]
+        hessian = np.sum([view.chain.T @ own @ view.chain for view, own in zip(views, products, strict=True)], axis=0)
         if prior is not None:
-            hessian += prior.terms(estimate.state)[1]
+            hessian = hessian + prior.terms(estimate.state)[1]
+        gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
+        for view, px in zip(views, common_px, strict=True):
+            moved = view.systematic.pushed_by_model(view.estimate, view.weights, view.chain, gain, px)
+            covariance = covariance + moved @ moved.T
+        if self._is_known:
+            pushes = [view.chain.T @ view.systematic.pushed(view.estimate, view.weights) for view in views]
+            transfer = gain @ np.sum(pushes, axis=0)
+            covariance = covariance + transfer @ transfer.T
+        return replace(estimate, covariance=covariance)
+
+    def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
+        views, first = [], 0
         for part, chain, systematic, count, view in zip(
             self._cameras, self._chains, self._systematic, self._counts, measured.views, strict=True
         ):
-            rows = estimate.residuals[first : first + count]
+            seen = replace(
+                estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
+            )
+            views.append(_View(chain, systematic, seen, view.weights[:count]))
             first += len(view.weights)
-            seen = replace(estimate, state=part.seen(estimate.state), residuals=rows)
-            own, pushed = systematic.pushed(seen, view.weights[:count])
-            hessian += chain.T @ own @ chain
-            pushes.append(chain.T @ pushed)
-        transfer = inverse_of_seen(hessian, self._scale) @ np.sum(pushes, axis=0)
-        return replace(estimate, covariance=estimate.covariance + transfer @ transfer.T)
+        return views
 
 
 #: A camera of which a smaller share of the points agrees with all cameras together contradicts them.
@@ -284,7 +335,7 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
-        self._reference = RigReference(self.trackers, self.cameras)
+        self._errors = RigErrors(self.trackers, self.cameras)
         self._sigma_px = FIRST_SIGMA_PX
 
     @property
@@ -331,6 +382,10 @@ class RigTracker:
         prior = None if known is None or has_moved else self._prior(known, results)
         with frame_clock(STAGES) as clock, stage("fuse"):
             estimate, measured, rejection = self._together(results, prior)
+            left: list[Unexplained] = []
+            if estimate is not None:
+                left = self._errors.unexplained(estimate, measured)
+                estimate = self._errors.added(estimate, measured, prior, [rest.px for rest in left])
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
@@ -358,6 +413,8 @@ class RigTracker:
         recovered = all(result.recovered or result.estimate is None for result in results)
         return replace(
             result,
+            warnings=(*warnings, *_not_explained(results, left)),
+            unexplained_px=max(rest.px for rest in left),
             status=Status.TRACKED,
             estimate=estimate,
             found_by=FoundBy.LAST_STATE if recovered else FoundBy.FLOW,
@@ -392,8 +449,7 @@ class RigTracker:
         estimate = self.estimator.fit(measured, estimate.state, prior)
         if np.isfinite(estimate.sigma_px):
             self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
-        estimate = self._filter.fuse(measured, estimate, prior)
-        return self._reference.added(estimate, measured, prior), measured, None
+        return self._filter.fuse(measured, estimate, prior), measured, None
 
     def _agreeing(self, measured: RigObservations, estimate: Estimate) -> RigObservations:
         """Without points that are far from the estimate, and without cameras of which most are."""
@@ -420,3 +476,15 @@ def _ignored(results: list[FrameResult], measured: RigObservations) -> list[Came
         elif not view.weights.any():
             found.append(CameraIgnored(number, result.status))
     return found
+
+
+def _not_explained(results: list[FrameResult], left: list[Unexplained]) -> list[TrackingWarning]:
+    """What to say where the common estimate leaves much of what a camera saw.
+
+    Where that camera alone is explained, it is the cameras that do not agree.
+    """
+    worst = int(np.argmax([rest.px for rest in left]))
+    if not left[worst].is_failure:
+        return []
+    alone = results[worst].warning(ModelDoesNotExplain) is not None
+    return [ModelDoesNotExplain(left[worst].px) if alone else CamerasDisagree(left[worst].px)]

@@ -131,6 +131,19 @@ class ModelDoesNotExplain(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class CamerasDisagree(TrackingWarning):
+    """Each of several cameras is explained by the model alone, and all together are not.
+
+    Attributes
+    ----------
+    residual_px : root mean square of what neighbouring points of one camera have in common, pixels.
+    """
+
+    template: ClassVar[str] = "the cameras do not agree with each other: {residual_px:.1f} px are left"
+    residual_px: float
+
+
+@dataclass(frozen=True)
 class SurfaceJumps(TrackingWarning):
     """The surface opens or slips along a line, and the model does not: stress near the line does not hold.
 

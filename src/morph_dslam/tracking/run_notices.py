@@ -13,7 +13,7 @@ from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
-from morph_dslam.tracking.outcomes import DepthNotUsed, ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.outcomes import CamerasDisagree, DepthNotUsed, ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 
@@ -42,6 +42,11 @@ class RunWarning(StrEnum):
     RIGID_FAILS = (
         "up to {largest_px:.1f} px that neighbouring points have in common are left in {count} of {n_frames} frames: "
         "the mesh, its place in the map or the camera file is off by as much"
+    )
+    CAMERAS_DISAGREE = (
+        "in {count} of {n_frames} frames the cameras do not agree with each other: up to {largest_px:.1f} px that "
+        "neighbouring points have in common are left; the poses of the cameras are wrong (`morph calibrate --with`), "
+        "or frames of one number are not of one instant"
     )
     SURFACE_JUMPS = (
         "from frame {first} on the surface opens or slips along a line, as at a crack, which the model does not have: "
@@ -122,6 +127,10 @@ def notices_of(run: RunResults) -> list[RunNotice]:
         largest = float(np.nanmax(run.unexplained_px()))
         warning = RunWarning.MODEL_FAILS if run.model.parameters else RunWarning.RIGID_FAILS
         found.append(of(warning, count=failed, n_frames=n_frames, largest_px=largest))
+    apart = [warning for result in run.results if (warning := result.warning(CamerasDisagree)) is not None]
+    if apart:
+        largest = max(warning.residual_px for warning in apart)
+        found.append(of(RunWarning.CAMERAS_DISAGREE, count=len(apart), n_frames=n_frames, largest_px=largest))
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
         found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import CameraError
+from morph_dslam.errors import CameraError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera, load_rig
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
@@ -106,6 +106,10 @@ def load_cameras(run: TrackOptions) -> tuple[RigCamera, ...]:
     cameras, count = load_rig(Path(name)), 1 + len(run.other_cameras)
     if len(cameras) != count:
         raise CameraError(f"{name} has {len(cameras)} cameras, but there are {count} recordings")
+    recordings = [str(recording) for recording in (run.frames, *run.other_cameras)]
+    twice = [recording for recording in set(recordings) if recordings.count(recording) > 1]
+    if twice:
+        raise TrackingError(f"{twice[0]} is given for two cameras: name what each of them recorded")
     return tuple(RigCamera(camera, pose) for camera, pose in cameras)
 
 

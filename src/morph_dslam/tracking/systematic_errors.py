@@ -254,17 +254,31 @@ class SystematicErrors:
         shown, *expected = np.diag(self._common.in_common(both, self._common.n_pairs(frame.usable)))
         self._misfit.learn(float(shown), float(sum(expected)))
 
-    def pushed(self, estimate: Estimate, weights: Array) -> tuple[Array, Array]:
-        """How points of these ``weights`` (p,) determine the estimate, and how the reference's error enters.
+    def products(self, estimate: Estimate, weights: Array) -> Array:
+        """J' W J (d + 6, d + 6): how points of these ``weights`` (p,) determine the estimate."""
+        return self._linearized(estimate, weights).hessian
 
-        Returns
-        -------
-        hessian : (d + 6, d + 6), J' W J
-        push : (d + 6, c), J' W M J0 times the error factors of the reference
-        """
+    def pushed(self, estimate: Estimate, weights: Array) -> Array:
+        """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters the estimate."""
         assert self._moved is not None
         frame = self._linearized(estimate, weights)
-        return frame.hessian, frame.products(self._warped(estimate.state, self._moved))
+        return frame.products(self._warped(estimate.state, self._moved))
+
+    def pushed_by_model(self, estimate: Estimate, weights: Array, chain: Array, gain: Array, common_px: float) -> Array:
+        """How an estimate from several cameras moves (n, c) by what the model is off in this one.
+
+        Parameters
+        ----------
+        estimate : in this camera's frame, with the residuals of its points
+        weights : (p,) of the points, zero for those that do not support it
+        chain : (d + 6, n) from the common unknowns to this camera's
+        gain : (n, n) H^-1 of all cameras together
+        common_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals
+        """
+        frame = self._linearized(estimate, weights)
+        gradients = self._common.gradients(frame.weighted_jacobian @ chain)
+        share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain)
+        return np.asarray(gain @ (common_px / np.sqrt(share) * gradients.T), dtype=np.float64)
 
     def _linearized(self, estimate: Estimate, weights: Array) -> _Linearization:
         """The frame of an estimate whose points had these ``weights`` (p,)."""
