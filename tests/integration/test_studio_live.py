@@ -177,6 +177,47 @@ def test_another_camera_takes_the_place_and_a_phone_comes_back(studio, film):
         assert np.linalg.norm(placed - true, axis=1).mean() < 1e-3
 
 
+def test_frames_of_an_earlier_run_stay_until_another_one_has_begun(studio, film):
+    """Through a frame that is taken, and a run that fails at once; the recording is the one before meanwhile."""
+    server, client, folder = studio
+    model, states, jpegs = film
+    (folder / "live").mkdir()
+    for number in range(6):
+        (folder / "live" / f"{number:06d}.jpg").write_bytes(jpegs[11])
+
+    def kept():
+        return sorted(path.name for path in (folder / "live").iterdir())
+
+    earlier = [f"{number:06d}.jpg" for number in range(1, 6)]
+    with a_phone(server, client) as phone:
+        phone.send(0, jpegs[0])
+        phone.wait_for("seen", 0)
+        client.call("take_frame")
+        assert kept() == ["000000.jpg", *earlier]
+        assert (folder / "live" / "000000.jpg").read_bytes() == jpegs[0]
+        off = np.add(clicked_pairs(model, states[0]), [1000, 0, 0, 0, 0])  # a metre beside the object
+        client.call("save_start", pairs=off.tolist(), frame=0, at_rest=False)
+        client.call("go_live")
+        for number in range(1, 8):
+            phone.send(number, jpegs[1])
+        job = wait_for_job(client, lambda job: not job["running"])
+        assert job["status"] == 2, job["lines"]
+        assert kept() == ["000000.png", *earlier]
+        assert client.state()["recording"]["frames"] == 6
+        client.call("save_start", pairs=clicked_pairs(model, states[0]), frame=0, at_rest=False)
+        client.call("go_live")
+        wait_for_job(client, lambda job: job["what"].startswith("tracking") or not job["running"])
+        for number in (1, 2):
+            phone.send(number, jpegs[number])
+            phone.picture_of(number)
+        client.call("stop")
+    wait_for_job(client, lambda job: not job["running"])
+    assert kept() == ["000000.png", "000001.jpg", "000002.jpg"]
+    assert [(folder / "live" / f"{k:06d}.jpg").read_bytes() == jpegs[k] for k in (1, 2)] == [True, True]
+    assert [row["frame"] for row in client.call("tracked_frames")["frames"]] == [1, 2]
+    assert client.state()["notes"]["run"] is None
+
+
 def test_only_who_was_let_in_may_send_or_look(studio):
     server, client, _ = studio
     own = phone_session(server, client.state()["phone"])

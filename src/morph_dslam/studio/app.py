@@ -91,13 +91,12 @@ class _Answers:
     async def upload(self, request: Request) -> Response:
         """Take in a file; the body is its content."""
         kind, name = request.path_params["kind"], request.path_params["name"]
-        path, allowed = self._steps.project.upload_path(kind, name)
+        _, allowed = self._steps.project.upload_path(kind, name)
         declared = request.headers.get("content-length", "")
         if declared.isdecimal() and int(declared) > allowed.largest:
             raise HTTPException(413, f"{name} is larger than {allowed.largest} bytes, the most that is taken")
-        path.parent.mkdir(exist_ok=True)
-        part, size = names.part_of(path), 0
-        try:
+        with self._steps.project.uploading(name) as part:
+            size = 0
             with part.open("wb") as file:
                 async for chunk in request.stream():
                     size += len(chunk)
@@ -106,10 +105,7 @@ class _Answers:
                             413, f"{name} is larger than {allowed.largest} bytes, the most that is taken"
                         )
                     await asyncio.to_thread(file.write, chunk)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-        return JSONResponse(await self._steps.uploaded(kind, name))
+            return JSONResponse(await self._steps.uploaded(kind, name, part))
 
     async def phone_code(self, request: Request) -> Response:
         """The address that a phone opens, as a QR code."""

@@ -41,7 +41,7 @@ def stamp(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # that of the project, and that of its run
 def _model(path: Path, seal: tuple[int, int]) -> ReducedModel:
     return load_model(path)
 

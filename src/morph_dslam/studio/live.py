@@ -114,14 +114,20 @@ class LiveRelay:
     ----------
     wanted : gives the size of frames by the camera file, None where there is none.
     keep : takes the number and the JPEG of each frame that the command gets.
+    begin : called when the command has tracked its first frame.
 
     Attributes
     ----------
     newest : JPEG of the last frame that came from the camera that sends; None without one.
     """
 
-    def __init__(self, wanted: Callable[[], Awaitable[Size | None]], keep: Callable[[int, bytes], None]) -> None:
-        self._wanted, self._keep = wanted, keep
+    def __init__(
+        self,
+        wanted: Callable[[], Awaitable[Size | None]],
+        keep: Callable[[int, bytes], None],
+        begin: Callable[[], None],
+    ) -> None:
+        self._wanted, self._keep, self._begin = wanted, keep, begin
         self._watching: set[_Outbox] = set()
         self._camera: _Outbox | None = None
         self._sending: WebSocket | None = None
@@ -174,6 +180,7 @@ class LiveRelay:
     def _picture_came(self, number: int, jpeg: bytes) -> None:
         if not self._is_tracking:
             self._is_tracking = True
+            self._begin()
             self._tell_all()
         camera, own = self._open.get(number, (None, 0))
         self._open = {one: frame for one, frame in self._open.items() if one > number}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +19,13 @@ STUDY, MESH, MODEL, REPORT = "study.toml", "mesh.inp", "model.morph", "model.rep
 CAMERA, LANDMARKS, RUN, FRAME_LOG = "camera.yaml", "landmarks.csv", "run", "track.jsonl"
 #: Folders of pictures: a recording as numbered images, and views of a calibration board.
 FRAMES, BOARD = "frames", "board"
-#: Frames of a live camera: number 0 is that of the start. Pairs that were clicked on another frame before.
+#: Frames of a live camera: number 0 is that of the start. Pairs that were clicked on another recording before.
 LIVE, EARLIER_LANDMARKS = "live", "landmarks-before.csv"
 #: Folder of the recording of the still scene.
 SCAN = "scan"
-_CHOICES = "studio.json"
+#: Where uploads wait until they have been looked at: hidden, so they are none of the project's files yet.
+UPLOADING = ".upload"
+_CHOICES, _DAMAGED = "studio.json", "studio-damaged{}.json"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -63,20 +69,34 @@ class Project:
 
     Parameters
     ----------
-    folder : is made if it does not exist.
+    folder : is made if it does not exist; the one around it must be there.
 
     Raises
     ------
     StudioError
-        If it cannot be made.
+        If it cannot be made, or nothing can be written into it.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).resolve()
+        if not self.folder.parent.is_dir():
+            raise StudioError(
+                f"cannot make the project folder {folder}: there is no folder {self.folder.parent}; check the path, or "
+                "make that folder first"
+            )
+        if self.folder.exists() and not self.folder.is_dir():
+            raise StudioError(f"{folder} is a file: name a folder for the project")
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(exist_ok=True)
         except OSError as error:
             raise StudioError(f"cannot make the project folder {folder}: {error.strerror or error}") from error
+        try:
+            tempfile.TemporaryFile(dir=self.folder).close()
+        except OSError as error:
+            raise StudioError(
+                f"nothing can be written into the project folder {folder} ({error.strerror or error}): choose another "
+                "folder, or change its permissions"
+            ) from error
 
     def path(self, name: str) -> Path:
         """A path inside of the project.
@@ -125,14 +145,57 @@ class Project:
             raise StudioError(f"{name} is written by the studio itself: give your file another name")
         return path, allowed
 
+    @contextmanager
+    def uploading(self, name: str) -> Iterator[Path]:
+        """Where an upload is written until it has been looked at, under the name that messages about it say."""
+        around = self.folder / UPLOADING
+        around.mkdir(exist_ok=True)
+        try:
+            with tempfile.TemporaryDirectory(dir=around) as folder:
+                yield Path(folder) / name
+        finally:
+            with suppress(OSError):  # others may be coming
+                around.rmdir()
+
     @property
     def choices(self) -> dict[str, Any]:
-        """What was chosen in the pages and stands in no other file."""
+        """What was chosen in the pages and stands in no other file; a file that is damaged is set aside.
+
+        Raises
+        ------
+        StudioError
+            If the file is there and may not be read.
+        """
+        return self._read_choices()
+
+    def _read_choices(self) -> dict[str, Any]:
+        path = self.path(_CHOICES)
         try:
-            content = json.loads(self.path(_CHOICES).read_text())
-        except (OSError, ValueError):
-            content = {}
-        return content if isinstance(content, dict) else {}
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise StudioError(f"{path} cannot be read ({error.strerror or error}): change its permissions") from error
+        except (ValueError, RecursionError):
+            content = None
+        if isinstance(content, dict):
+            return content
+        free = (self.path(_DAMAGED.format(number)) for number in ("", *(f"-{k}" for k in range(2, 1000))))
+        path.replace(next(other for other in free if not other.exists()))
+        self.set_aside_pairs()  # the frame that they belong to stood in that file
+        return {}
+
+    @property
+    def damage(self) -> str | None:
+        """What to tell of a damaged file of choices that was set aside; None if there is none."""
+        self._read_choices()
+        found = [name for name in self.files() if re.fullmatch(_DAMAGED.format("(-[0-9]+)?"), name)]
+        if not found:
+            return None
+        return (
+            f"{_CHOICES} was damaged, and is kept as {' and '.join(found)}: choose the object and the recording anew; "
+            f"or stop the studio, mend the file and name it {_CHOICES} again. Delete it when it is of no use any more."
+        )
 
     def choose(self, **values: Any) -> None:
         """Remember choices; None forgets one."""
@@ -151,6 +214,59 @@ class Project:
         """Name of the video or of the folder of images that is tracked, None if there is none."""
         name = self.choices.get("recording")
         return name if isinstance(name, str) and self.has(name) else None
+
+    def take_recording(self, name: str, reference_frame: int | None = None, is_another: bool = False) -> None:
+        """Track this recording from now on; pairs that were clicked on another one are set aside.
+
+        Parameters
+        ----------
+        name : of the recording.
+        reference_frame : that the start is of, None for the first one.
+        is_another : whether it is not the one that had this name before.
+        """
+        before = self.choices.get("recording")
+        if before is not None and (before != name or is_another):
+            self.set_aside_pairs()
+        self.choose(recording=name, reference_frame=reference_frame)
+
+    def set_aside_pairs(self) -> None:
+        """Keep the pairs as those of an earlier recording: their pixels mean nothing in another one."""
+        landmarks = self.path(LANDMARKS)
+        if landmarks.is_file():
+            landmarks.replace(self.path(EARLIER_LANDMARKS))
+            self.choose(pairs_were_of=self.choices.get("recording", ""))
+        self.choose(reference_frame=None)
+
+    @property
+    def aside(self) -> str | None:
+        """What to tell of pairs that were set aside; None if none were, or others give the start since."""
+        name, is_by_scan = self.choices.get("pairs_were_of"), self.choices.get("start") == "scan"
+        if name is None or is_by_scan or self.has(LANDMARKS) or not self.has(EARLIER_LANDMARKS):
+            return None
+        of = f"an earlier recording ({name})" if name else "a frame that is not known any more"
+        return (
+            f"The pairs were clicked on {of}, and are kept in {EARLIER_LANDMARKS}: click pairs on this recording, and "
+            "save them."
+        )
+
+    def outdate_run(self) -> None:
+        """Remember that what the present run was tracked in has been replaced."""
+        seal = self._run_seal()
+        if seal is not None:
+            self.choose(outdated_run=seal)
+
+    @property
+    def is_run_outdated(self) -> bool:
+        """Whether what the run was tracked in has been replaced since."""
+        seal = self._run_seal()
+        return seal is not None and seal == self.choices.get("outdated_run")
+
+    def _run_seal(self) -> str | None:
+        """Checksum of the summary, of which no two runs have the same; None if there is no run."""
+        try:
+            return hashlib.sha256(self.path(f"{RUN}/summary.json").read_bytes()).hexdigest()
+        except OSError:
+            return None
 
     def files(self) -> list[str]:
         """Names of the files and folders, hidden ones left out."""

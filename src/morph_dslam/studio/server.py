@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import re
+import shutil
 import signal
 import socket
 import webbrowser
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 from types import FrameType
 
 import uvicorn
 
-from morph_dslam.errors import StudioError
+from morph_dslam.errors import StudioError, TrackingError
 from morph_dslam.io.access import HOST, ServerNames, new_token
+from morph_dslam.io.folders import only_writer
 from morph_dslam.studio.app import make_app, phone_app
 from morph_dslam.studio.gate import Access
 from morph_dslam.studio.live import WEBSOCKETS
 from morph_dslam.studio.phone import PhoneServer, own_address
-from morph_dslam.studio.project import Project
+from morph_dslam.studio.project import UPLOADING, Project
 from morph_dslam.studio.steps import Steps
+
+#: Hidden file that says where the studio of a project answers, without its token.
+_OPEN_AT = ".studio-address"
 
 
 class StudioServer:
@@ -28,13 +34,14 @@ class StudioServer:
 
     Parameters
     ----------
-    folder : of the project; it is made.
+    folder : of the project; it is made, the one around it is not.
     port : 0 takes any free one.
     host : address to listen at; that of this computer alone by default.
     phone : whether phones in the network may bring recordings, at the next port.
 
     Attributes
     ----------
+    project : that is served.
     address : with the token, to be opened in a browser.
     phone_access : of phones, None if none is let in.
     phone_port : that a phone opens, 0 if none is let in.
@@ -42,16 +49,23 @@ class StudioServer:
     Raises
     ------
     StudioError
-        If the folder cannot be made, or the address cannot be taken.
+        If the folder cannot be made or written to, another studio serves it, or the address cannot be taken.
     """
 
     def __init__(self, folder: str | Path, port: int = 8766, host: str = HOST, phone: bool = False) -> None:
         project, self.token = Project(folder), new_token()
-        self._socket = _listening(host, port)
+        self.project = project
+        with ExitStack() as opened:
+            _keep_others_out(opened, project)
+            self._socket = opened.enter_context(_listening(host, port))
+            self._phone_socket = None
+            if phone:
+                own_port = int(self._socket.getsockname()[1])
+                self._phone_socket = opened.enter_context(_listening("0.0.0.0", own_port + 1 if port else 0))
+            self._opened = opened.pop_all()
         self.port = int(self._socket.getsockname()[1])
         names = ServerNames() if host == HOST else ServerNames((host, socket.gethostname()), any_address=True)
         self.phone_access = Access.single() if phone else None
-        self._phone_socket = _listening("0.0.0.0", self.port + 1 if port else 0) if phone else None
         self.phone_port = int(self._phone_socket.getsockname()[1]) if self._phone_socket else 0
         self._phone_host = own_address()
         steps = Steps(project, lambda: self.phone_address)
@@ -64,6 +78,7 @@ class StudioServer:
         self._server = _Server(config, steps)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else host
         self.address = f"http://{shown}:{self.port}/?token={self.token}"
+        (project.folder / _OPEN_AT).write_text(self.address.partition("?")[0] + "\n")
 
     @property
     def phone_address(self) -> str | None:
@@ -87,8 +102,9 @@ class StudioServer:
             await task
 
     def run(self) -> None:
-        """Answer until the process is interrupted, or `stop`."""
-        self._server.run(sockets=[self._socket])
+        """Answer until the process is interrupted, or `stop`; then other studios may serve the project."""
+        with self._opened:
+            self._server.run(sockets=[self._socket])
 
     @property
     def started(self) -> bool:
@@ -118,6 +134,24 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
 
+def _keep_others_out(opened: ExitStack, project: Project) -> None:
+    """Lock the project, and take away what uploads of a studio that was killed have left; raises StudioError."""
+    try:
+        opened.enter_context(only_writer(project.folder))
+    except TrackingError as error:
+        try:
+            found = re.fullmatch(r"http://[\w.:\[\]-]+/", (project.folder / _OPEN_AT).read_text().strip())
+        except (OSError, ValueError):
+            found = None
+        where = f" at {found[0]}" if found else ""
+        raise StudioError(
+            f"another studio{where} serves {project.folder} already: use that one, or end it first (Ctrl-C in its "
+            "terminal)"
+        ) from error
+    opened.callback((project.folder / _OPEN_AT).unlink, missing_ok=True)
+    shutil.rmtree(project.folder / UPLOADING, ignore_errors=True)
+
+
 def _listening(host: str, port: int) -> socket.socket:
     try:
         listening = socket.create_server((host, port), backlog=64)
@@ -135,7 +169,7 @@ def open_studio(
 
     Parameters
     ----------
-    folder : of the project; it is made.
+    folder : of the project; it is made, the one around it is not.
     port : 0 takes any free one.
     host : address to listen at; that of this computer alone by default.
     open_browser : whether to open the page at once.
@@ -144,10 +178,12 @@ def open_studio(
     Raises
     ------
     StudioError
-        If the folder cannot be made, or the address cannot be taken.
+        If the folder cannot be made or written to, another studio serves it, or the address cannot be taken.
     """
     server = StudioServer(folder, port, host, phone)
     print(f"the studio of {Path(folder).resolve()} is at {server.address} (Ctrl-C ends it)", flush=True)
+    if server.project.damage is not None:
+        print(f"note: {server.project.damage}", flush=True)
     if phone:
         print(f"a phone records at {server.phone_address}, once; its browser warns of the certificate", flush=True)
     if open_browser:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import json
+import filecmp
+import shlex
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,8 +12,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from morph_dslam.errors import StudioError
-from morph_dslam.studio import clicks, object_mesh, project as names, recording, study_file
-from morph_dslam.studio.jobs import Jobs
+from morph_dslam.studio import clicks, object_mesh, project as names, recording, run_files, study_file
+from morph_dslam.studio.jobs import Job, Jobs
 from morph_dslam.studio.live_steps import LiveSteps
 from morph_dslam.studio.project import Project
 from morph_dslam.studio.scan_steps import ScanSteps
@@ -25,6 +26,11 @@ _UNIT = "mm"
 Unit = Literal["m", "cm", "mm", "um"]
 Name = Annotated[str, Field(min_length=1, max_length=80)]
 Pairs = list[list[float]]
+#: How uploads are looked at before they take the place of a file of the same name.
+_CHECKS: dict[str, Callable[[Path], Any]] = {
+    "camera": clicks.camera_facts, "recording": recording.recording_facts, "scan": recording.recording_facts,
+    "landmarks": clicks.read_clicks,
+}  # fmt: skip
 #: A length or a board as the command line takes it; never an option.
 Words = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. :=-]*$", max_length=60)]
 
@@ -48,6 +54,7 @@ class Steps:
         self._changed = asyncio.Event()
         self._jobs = Jobs(project.folder, self._tell)
         self._ended = False
+        self._reads_earlier: tuple[Job, str] | None = None
         self.scan = ScanSteps(project, self._worker, self._jobs)
         self.live = LiveSteps(project, self._worker, self._jobs, self.scan)
         self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
@@ -62,6 +69,9 @@ class Steps:
         self.actions |= self.scan.actions
 
     def _tell(self) -> None:
+        if self._reads_earlier is not None and not self._reads_earlier[0].running:
+            (_, name), self._reads_earlier = self._reads_earlier, None
+            self._outdate_run_of(name)  # what it was tracked in was replaced meanwhile
         self._changed.set()
 
     def recording_came(self) -> None:
@@ -77,22 +87,24 @@ class Steps:
         """Stop the command that runs, and end the worker."""
         self.end_news()
         await self._jobs.stop()
-        await self.live.relay.close()
+        await self.live.close()
         self._worker.close()
 
     # -- what there is -----------------------------------------------------------------------------
 
     async def state(self) -> dict[str, Any]:
         """The files of the project, what was chosen, what each step has, and the job."""
-        has = self.project.has
+        has, project = self.project.has, self.project
+        problem = await self._run_problem()
+        is_tracked = has(f"{names.RUN}/summary.json") and problem is None
         done = {
             "object": has(names.MESH),
             "study": has(names.STUDY) and not (await self.study())["problems"],
             "build": has(names.MODEL),
             "camera": has(names.CAMERA) and self.project.recording is not None,
             "start": self.scan.is_accepted if self.scan.is_chosen else has(names.LANDMARKS),
-            "track": has(f"{names.RUN}/summary.json"),
-            "results": has(f"{names.RUN}/summary.json"),
+            "track": is_tracked,
+            "results": is_tracked,
         }
         state: dict[str, Any] = {
             "folder": str(self.project.folder),
@@ -101,6 +113,7 @@ class Steps:
             "done": done,
             "job": self._jobs.content(),
             "phone": self.phone_address(),
+            "notes": {"settings": project.damage, "start": project.aside, "run": problem},
         }
         for name, path, read in (
             ("camera", names.CAMERA, clicks.camera_facts),
@@ -115,7 +128,7 @@ class Steps:
 
     async def news(self) -> AsyncIterator[tuple[str, Any]]:
         """The job at each change, and the lines of the frame log as they come, until the studio ends."""
-        told, offset, arrivals = None, 0, self._arrivals
+        told, log, arrivals = None, run_files.FrameLog(self.project.path(names.FRAME_LOG)), self._arrivals
         while not self._ended:
             job = self._jobs.content()
             if job != told:
@@ -124,7 +137,7 @@ class Steps:
             if self._arrivals != arrivals:
                 arrivals = self._arrivals
                 yield "recording", self.project.recording
-            lines, offset = _new_lines(self.project.path(names.FRAME_LOG), offset)
+            lines = log.new()
             if lines is not None:
                 yield "frames", lines
             self._changed.clear()
@@ -135,37 +148,66 @@ class Steps:
 
     # -- object ------------------------------------------------------------------------------------
 
-    async def uploaded(self, kind: str, name: str) -> dict[str, Any]:
-        """Look at what was uploaded; a file that cannot be read is taken out again."""
+    async def uploaded(self, kind: str, name: str, part: Path) -> dict[str, Any]:
+        """Look at what was uploaded, and take it in; one that cannot be read leaves the file of its name as it is.
+
+        Parameters
+        ----------
+        kind, name : of the upload.
+        part : the file that came.
+        """
         project = self.project
         path, _ = project.upload_path(kind, name)
-        try:
-            if kind == "camera":
-                await self._worker.call(clicks.camera_facts, path)
-                project.write(names.CAMERA, path.read_text()) if path.name != names.CAMERA else None
-                project.choose(camera_from=name, camera_note=None)
-            elif kind == "recording":
-                await self._worker.call(recording.recording_facts, path)
-                project.choose(recording=name, reference_frame=None)
-            elif kind == "scan":
-                await self._worker.call(recording.recording_facts, path)
-                self.scan.uploaded(name)
-            elif kind == "landmarks":
-                await self._worker.call(clicks.read_clicks, path)
-                project.write(names.LANDMARKS, path.read_text()) if path.name != names.LANDMARKS else None
-        except StudioError:
-            path.unlink(missing_ok=True)
-            raise
-        if kind == "object":
+        if kind in _CHECKS:
+            await self._check_upload(kind, part, path)
+        replaces = path.exists() and not await asyncio.to_thread(filecmp.cmp, part, path, shallow=False)
+        path.parent.mkdir(exist_ok=True)
+        part.replace(path)
+        if kind == "camera":
+            project.write(names.CAMERA, path.read_text()) if path.name != names.CAMERA else None
+            project.choose(camera_from=name, camera_note=None)
+        elif kind == "landmarks":
+            project.write(names.LANDMARKS, path.read_text()) if path.name != names.LANDMARKS else None
+            project.choose(pairs_were_of=None)
+        elif kind == "scan":
+            self.scan.uploaded(name)
+        elif kind == "object":
             project.choose(object=None, sets=None)
-        elif kind == "frame":
-            project.choose(recording=names.FRAMES, reference_frame=None)
-        return {"name": name}
+        elif kind in ("recording", "frame"):
+            self._take_recording(name if kind == "recording" else names.FRAMES, replaces)
+        return {"name": name, "note": project.aside if kind in ("recording", "frame") else None}
+
+    async def _check_upload(self, kind: str, part: Path, path: Path) -> None:
+        try:
+            await self._worker.call(_CHECKS[kind], part)
+        except StudioError as error:
+            kept = f"; the {path.name} that was there before is kept" if path.exists() else ""
+            raise StudioError(f"{str(error).replace(str(part), path.name)}{kept}") from error
+
+    def _take_recording(self, name: str, replaces: bool) -> None:
+        """Track another recording, or the same one if nothing of it was replaced."""
+        if replaces:
+            self._outdate_run_of(name)
+        if replaces or self.project.choices.get("recording") != name:
+            self.project.take_recording(name, is_another=replaces)
+
+    def _outdate_run_of(self, name: str) -> None:
+        """What has this name is replaced: a run of it, also one that is still tracked, is of what was there before."""
+        if run_files.run_of(self.project.path(names.RUN), names.LIVE) == name:
+            self.project.outdate_run()
+        job = self._jobs.job
+        if job is not None and job.running and job.kind == "track" and name in shlex.split(job.command):
+            self._reads_earlier = job, name
 
     async def forget_frames(self, folder: Literal["frames", "board"]) -> dict[str, Any]:
         """Take out the pictures of a recording, or of a board, before others come."""
         path = self.project.path(folder)
-        for file in path.iterdir() if path.is_dir() else ():
+        files = list(path.iterdir()) if path.is_dir() else []
+        if files and folder == names.FRAMES:
+            self._outdate_run_of(folder)
+            if self.project.choices.get("recording") == folder:
+                self.project.set_aside_pairs()
+        for file in files:
             file.unlink()
         return {}
 
@@ -242,6 +284,8 @@ class Steps:
 
     async def build(self) -> dict[str, Any]:
         """Start `morph build`, or go on with one that was stopped."""
+        self._jobs.check_idle()
+        self._needed(names.STUDY, "load the object, and describe the study first")
         await self._jobs.start("build", ["build", names.STUDY, "-o", names.MODEL])
         return {}
 
@@ -323,19 +367,20 @@ class Steps:
     async def save_start(self, pairs: Pairs, frame: int, at_rest: bool) -> dict[str, Any]:
         """Write landmarks.csv."""
         await self._worker.call(clicks.save_clicks, pairs, self.project.path(names.LANDMARKS))
-        self.project.choose(reference_frame=frame, at_rest=at_rest)
+        self.project.choose(reference_frame=frame, at_rest=at_rest, pairs_were_of=None)
         return {"file": names.LANDMARKS}
 
     # -- track and results -------------------------------------------------------------------------
 
     async def track(self, refine: bool = False, snap: bool = False, outline: bool = False) -> dict[str, Any]:
-        """Start `morph track`."""
+        """Start `morph track`, which begins the frame log anew when it has read what it needs."""
+        self._jobs.check_idle()
         self._model_and_camera()
         words = ["track", self._recording().name, "--model", names.MODEL, "--camera", names.CAMERA]
         words += self.scan.track_words() if self.scan.is_chosen else self._pairs_words(refine, snap)
         words += ["--outline"] if outline else []
         words += ["--frame-log", names.FRAME_LOG, "--overwrite", "-o", names.RUN]
-        self.project.path(names.FRAME_LOG).unlink(missing_ok=True)
+        run_files.clear_broken_log(self.project.path(names.FRAME_LOG))
         await self._jobs.start("track", words)
         return {}
 
@@ -350,45 +395,61 @@ class Steps:
         flags = {"--at-rest": at_rest, "--snap": snap, "--refine": refine}
         return words + [flag for flag, is_set in flags.items() if is_set]
 
-    async def tracked_frames(self) -> dict[str, Any]:
-        """The frames that were tracked, and the summary of the run where it is finished."""
-        lines, _ = _new_lines(self.project.path(names.FRAME_LOG), 0)
-        summary = self.project.path(f"{names.RUN}/summary.json")
-        found = json.loads(summary.read_text()) if summary.is_file() else None
-        return {"frames": (lines or {"frames": []})["frames"], "summary": found}
+    async def _run_problem(self) -> str | None:
+        """Why the run cannot be shown over the recording with the model; None if it can, or if there is none."""
+        run = self.project.path(names.RUN)
+        name, now = run_files.run_of(run, names.LIVE), self.project.choices.get("recording")
+        if name is None:
+            return None
+        if name != now:
+            return f"this run is of {name}, and the recording is {now or 'not there'}: track again"
+        if self.project.is_run_outdated:
+            return f"this run is of an earlier {name}, which was replaced: track again"
+        return await self._model_problem()
 
-    async def overlay(self, frame: int) -> bytes:
-        """The model over a tracked frame."""
-        lines, _ = _new_lines(self.project.path(names.FRAME_LOG), 0)
-        row = next((row for row in (lines or {"frames": []})["frames"] if row["frame"] == frame), None)
-        if row is None or row["camera_from_object"] is None or None in row["parameters"].values():
-            raise StudioError(f"the object was not tracked in frame {frame}")
-        state = list(row["parameters"].values()), row["camera_from_object"]
-        return await self._worker.call(clicks.overlay, *self._model_and_camera(), *state)
+    async def _model_problem(self) -> str | None:
+        """Why the run's states are none of the model; None if they are."""
+        run, model = self.project.path(names.RUN), self.project.path(names.MODEL)
+        try:
+            is_same = await self._worker.call(run_files.is_of_model, run, model)
+        except StudioError as error:
+            return str(error)
+        own = f"{names.RUN}/{names.MODEL}"
+        return None if is_same else f"this run is of another model, kept as {own}, than {names.MODEL}: track again"
+
+    async def tracked_frames(self) -> dict[str, Any]:
+        """The frames of the run, its summary, and why it cannot be shown; without a run, those tracked so far."""
+        run = self.project.path(names.RUN)
+        frames = await self._worker.call(run_files.run_frames, run)
+        summary = await self._worker.call(run_files.run_summary, run)
+        frames = self._logged_frames() if frames is None else frames
+        return {"frames": frames, "summary": summary, "problem": await self._run_problem()}
+
+    def _logged_frames(self) -> list[dict[str, Any]]:
+        lines = run_files.FrameLog(self.project.path(names.FRAME_LOG)).new()
+        return [] if lines is None else lines["frames"]
+
+    async def overlay(self, frame: int, of: Literal["run", "log"] = "run") -> bytes:
+        """The model over a frame of the run, or of the frame log, which has those that are being tracked."""
+        job = self._jobs.job
+        is_tracking = job is not None and job.running and job.kind in ("track", "live")
+        problem = None if is_tracking and of == "log" else await self._run_problem()
+        if problem is not None:
+            raise StudioError(problem)
+        model, camera = self._model_and_camera()
+        run = self.project.path(names.RUN)
+        if of == "run" and (run / "result.h5").is_file():
+            return await self._worker.call(run_files.run_overlay, run, model, camera, frame)
+        row = next((row for row in self._logged_frames() if row["frame"] == frame), None)
+        return await self._worker.call(run_files.row_overlay, model, camera, row, frame)
 
     async def export(self, format: Literal["vtu", "xdmf", "gltf"]) -> dict[str, Any]:
         """Start `morph export` of the tracked states."""
         table = f"{names.RUN}/frames.csv"
         self._needed(table, "track the video first")
+        problem = await self._model_problem()
+        if problem is not None:
+            raise StudioError(problem)
         target = f"export-{format}"
         await self._jobs.start("export", ["export", names.MODEL, "--format", format, "--path", table, "-o", target])
         return {"folder": target}
-
-
-def _new_lines(path: Path, offset: int) -> tuple[dict[str, Any] | None, int]:
-    """Whole lines of a frame log since an offset, None if nothing is new; a file that was begun anew is read anew."""
-    try:
-        size = path.stat().st_size
-    except OSError:
-        return (None if offset == 0 else {"anew": True, "frames": []}), 0
-    anew = size < offset
-    if size == offset:
-        return None, offset
-    start = 0 if anew else offset
-    with path.open("rb") as file:
-        file.seek(start)
-        text = file.read(size - start)
-    text = text[: text.rfind(b"\n") + 1]
-    if not text and not anew:
-        return None, offset
-    return {"anew": start == 0, "frames": [json.loads(line) for line in text.splitlines()]}, start + len(text)

@@ -92,6 +92,7 @@ export async function cameraStep(app) {
       app.view.replaceChildren(container, el('span', { className: 'tag' }, `frame ${found.first}`));
       new ImageView(container).setImage(await frame(found.first));
     } else app.view.replaceChildren(el('div', { className: 'empty' }, 'The first frame appears here.'));
+    if (state.notes.start) recording.append(el('p', { className: 'warning note', id: 'pairs-note' }, state.notes.start));
     const one = state.camera;
     camera.replaceChildren();
     if (one?.message) camera.append(el('p', { className: 'problem' }, one.message));

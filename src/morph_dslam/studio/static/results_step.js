@@ -6,23 +6,30 @@ import { SolidView } from './solid_view.js';
 import { RunPicture } from './track_step.js';
 import { makePlots } from './plot.js';
 
+const download = (name, text) => el('a', { href: `/files/${name}`, download: '', className: 'button' }, text);
+const downloads = () => el('div', { className: 'row' }, download('run/frames.csv', 'CSV'), download('run/augmented.mp4', 'MP4'),
+  download('run/result.h5', 'HDF5'));
+
 export async function resultsStep(app) {
   app.panel.append(...title('Results', 'Every frame in the image and in space, and files for other programs.'));
   if (!app.state.done.track) {
-    app.panel.append(el('p', { className: 'problem' }, 'Track the video first.'));
+    const problem = app.state.notes.run;
+    app.panel.append(el('p', { className: 'problem', id: 'run-note' }, problem ?? 'Track the video first.'));
+    if (problem) {
+      app.panel.append(el('p', { className: 'note' }, 'The files of that run are kept until then:'), downloads());
+    }
     return {};
   }
   const [mesh, model, surface, run] = await Promise.all([
     call('model_mesh'), call('model'), explored('model.json'), call('tracked_frames')]);
   const { frames, summary } = run;
   if (!frames.length) {
-    app.panel.append(el('p', { className: 'problem' }, 'track.jsonl is not there: track the video here once more.'));
+    app.panel.append(el('p', { className: 'problem' }, 'The run holds no frames: track the video here once more.'));
     return {};
   }
   const slider = el('input', { id: 'scrub', type: 'range', min: 0, max: frames.length - 1, value: 0 });
   const values = el('div', { id: 'frame-facts' });
   const exported = el('p', { className: 'note' });
-  const download = (name, text) => el('a', { href: `/files/${name}`, download: '', className: 'button' }, text);
   const write = (format, text) => el('button', { id: `export-${format}`, onclick: () => app.doing(async () => {
     await call('export', { format });
     exported.replaceChildren();
@@ -63,8 +70,7 @@ export async function resultsStep(app) {
       ['Time a frame', `${summary.median_ms.toFixed(0)} ms`]]),
     el('h3', {}, 'Files'),
     el('p', { className: 'note' }, 'Download'),
-    el('div', { className: 'row' }, download('run/frames.csv', 'CSV'), download('run/augmented.mp4', 'MP4'),
-      download('run/result.h5', 'HDF5')),
+    downloads(),
     el('p', { className: 'note' }, 'Write the tracked states into the project folder'),
     el('div', { className: 'row' }, write('vtu', 'VTU'), write('xdmf', 'XDMF'), write('gltf', 'glTF')),
     exported, command('morph export model.morph --path run/frames.csv …'),

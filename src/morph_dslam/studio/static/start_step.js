@@ -25,6 +25,8 @@ export async function startStep(app) {
   way.addEventListener('change', () => app.doing(async () => { await call('start_by', { way: way.value }); await app.show('start'); }));
   app.panel.append(field('Start by', way));
   if (way.value === 'scan') return scanStart(app);
+  const aside = el('p', { className: 'warning note', id: 'pairs-note', hidden: !app.state.notes.start }, app.state.notes.start ?? '');
+  app.panel.append(aside);
   const [mesh, known, model, { colours }] = await Promise.all([
     call('model_mesh'), call('start_files'), call('model'), explored('model.json')]);
   const first = recording.first;
@@ -58,6 +60,7 @@ export async function startStep(app) {
   const save = el('button', { id: 'save-start', className: 'main', onclick: () => app.doing(async () => {
     await call('save_start', { pairs, frame: number, at_rest: atRest.checked });
     saved = true;
+    aside.hidden = true;
     await app.refresh();
     draw();
   }) }, 'Save');
@@ -80,6 +83,7 @@ export async function startStep(app) {
         await upload('landmarks', file);
         pairs = (await call('start_files')).pairs;
         await call('save_start', { pairs, frame: number, at_rest: atRest.checked });
+        aside.hidden = true;
         await app.refresh();
         await fit();
       }))),
@@ -156,5 +160,5 @@ export async function startStep(app) {
   image.setImage(await frame(number));
   if (pairs.length) { const was = saved; await fit(); saved = was; }
   draw();
-  return { close: () => clearTimeout(thorough) };
+  return { close: () => clearTimeout(thorough), recording: () => app.show('start') };
 }

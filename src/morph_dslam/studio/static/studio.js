@@ -39,6 +39,9 @@ class Studio {
     this.state = await server.state();
     document.getElementById('folder').textContent = this.state.folder.split('/').at(-1);
     document.getElementById('folder').title = this.state.folder;
+    const note = document.getElementById('settings-note');
+    note.textContent = this.state.notes.settings ?? '';
+    note.hidden = !note.textContent;
     this.drawSteps();
     this.drawJob();
   }

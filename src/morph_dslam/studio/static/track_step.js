@@ -8,10 +8,10 @@ import { makePlots } from './plot.js';
 
 const MOST_PLOTTED = 600; // frames of a live run
 
-// The picture of a frame with the model over it.
+// The picture of a frame with the model over it; of: the run in its folder, or the log of what is being tracked.
 export class RunPicture {
-  constructor(container, mesh, colours) {
-    Object.assign(this, { container, mesh, colours, view: new ImageView(container), busy: false, wanted: null });
+  constructor(container, mesh, colours, of = 'run') {
+    Object.assign(this, { container, mesh, colours, of, view: new ImageView(container), busy: false, wanted: null });
   }
 
   // Shows the frame that was asked for last; ones in between are left out.
@@ -24,7 +24,7 @@ export class RunPicture {
         const next = this.wanted;
         this.wanted = null;
         const tracked = next.status === 'tracked';
-        const [image, overlay] = await Promise.all([frame(next.frame), tracked ? call('overlay', { frame: next.frame }) : null]);
+        const [image, overlay] = await Promise.all([frame(next.frame), tracked ? call('overlay', { frame: next.frame, of: this.of }) : null]);
         this.view.setOverlay(overlay, this.mesh.triangles, this.colours);
         this.view.setImage(image);
         this.container.parentElement.querySelector('.bar')?.remove();
@@ -69,7 +69,7 @@ export async function trackStep(app) {
   const picture = el('div', { className: 'fill', id: 'track-image' });
   const plots = el('div', { className: 'plots' });
   app.view.append(el('div', { className: 'runview' }, el('div', {}, picture), plots));
-  const shown = new RunPicture(picture, mesh, colours);
+  const shown = new RunPicture(picture, mesh, colours, 'log');
   const live = liveView(app, picture, () => drawJob(app.state.job));
   liveParts.append(el('h3', {}, 'Live'), ...live.parts, goLive,
     command(`morph live … ${byScan ? '' : '--reference-image live/000000.png '}--frame-log track.jsonl -o run`));
@@ -98,6 +98,8 @@ export async function trackStep(app) {
     if (mine && !mine.running && mine.status) {
       parts.push(el('p', { className: mine.stopped ? 'warning' : 'problem' }, mine.lines.at(-1) ?? 'it ended without a message'));
     }
+    const { run: problem } = app.state.notes;
+    if (problem && !mine?.running) parts.push(el('p', { className: 'warning', id: 'run-note' }, problem));
     if (app.state.done.track && !mine?.running) {
       parts.push(el('button', { id: 'to-results', onclick: () => app.show('results') }, 'Next: results'));
     }
