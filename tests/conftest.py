@@ -6,6 +6,7 @@ A shared folder is only read; what a test writes goes into its own ``tmp_path``.
 import fcntl
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import cv2
@@ -49,6 +50,14 @@ def refused(capsys):
         return said[0]
 
     return message_of
+
+
+@pytest.fixture
+def interruptible():
+    """As in a terminal; what a shell runs in the background ignores Ctrl-C, and so do the tests there."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

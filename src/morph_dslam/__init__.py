@@ -35,7 +35,6 @@ _MODULES = {
     "TrackingWarning": "tracking.outcomes",
     "build": "studies.build",
     "calibrate": "calibration.calibrate",
-    "calibrate_rig": "calibration.rig",
     "evaluate": "evaluation.evaluate",
     "evaluate_depth": "evaluation.evaluate",
     "evaluate_trajectory": "evaluation.trajectory",
@@ -65,7 +64,6 @@ __all__ = sorted(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.calibration.board import Board as Board
     from morph_dslam.calibration.calibrate import calibrate as calibrate
-    from morph_dslam.calibration.rig import calibrate_rig as calibrate_rig
     from morph_dslam.camera import Camera as Camera
     from morph_dslam.errors import MorphError as MorphError
     from morph_dslam.evaluation.evaluate import evaluate as evaluate, evaluate_depth as evaluate_depth

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import pkgutil
+import signal
+from itertools import count
 
 import cv2
 import h5py
@@ -10,6 +13,7 @@ import pytest
 
 from morph_dslam import TrackerOptions, TrackOptions, track
 from morph_dslam.camera import Camera
+from morph_dslam.cli.app import main
 from morph_dslam.errors import CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
@@ -20,6 +24,7 @@ from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import SheetFilm, sheet_state, write_landmarks, write_recording
 
 TIMES = np.linspace(0.0, 0.24, 7)
+FILES = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml", "landmarks": "landmarks.csv"}
 BLANK = 4  # position of the frame that shows nothing
 
 
@@ -36,9 +41,8 @@ def inputs(tmp_path_factory):
 
 
 def options(inputs, output, **changes):
-    files = {"frames": "frames", "model": "sheet.morph", "camera": "camera.yaml", "landmarks": "landmarks.csv"}
     # The landmarks are exact but for rounding.
-    known = {name: inputs / path for name, path in files.items()} | {"click_px": 0.01, "output": output}
+    known = {name: inputs / path for name, path in FILES.items()} | {"click_px": 0.01, "output": output}
     return TrackOptions(**known | changes)
 
 
@@ -147,6 +151,91 @@ def test_interrupt_keeps_the_frames_so_far(inputs, tmp_path, monkeypatch):
         track(options(inputs, tmp_path / "run"))
     assert load_run(tmp_path / "run").frames.tolist() == [20, 21, 22]
     assert (tmp_path / "run" / "augmented.mp4").is_file()
+
+
+@pytest.fixture
+def interrupted_at(interruptible, monkeypatch):
+    """A function: what is called at a place, by its name, sends Ctrl-C first, as often as a number says."""
+
+    def at(place, calls, times=1):
+        owner, _, name = place.rpartition(".")
+        function = getattr(pkgutil.resolve_name(owner), name)
+        numbers = count(1)
+
+        def interrupted(*args, **kwargs):
+            if next(numbers) in calls:
+                for _ in range(times):
+                    signal.raise_signal(signal.SIGINT)
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(place, interrupted)
+
+    return at
+
+
+def command(inputs, output, *more):
+    files = [f"--{name}={inputs / path}" for name, path in FILES.items() if name != "frames"]
+    return ["track", str(inputs / FILES["frames"]), *files, "-o", str(output), *more]
+
+
+IN_A_FRAME, REFINING, WRITING, DRAWING = (
+    "morph_dslam.tracking.tracker.Tracker.track",
+    "morph_dslam.tracking.track.refine_reference",
+    "morph_dslam.tracking.run_folder.save_model",
+    "morph_dslam.io.video.VideoWriter.write",
+)
+FOURTH = (6,)  # two calls warm up
+
+
+def test_ctrl_c_ends_a_run_behind_the_frame_that_is_tracked(inputs, tmp_path, interrupted_at, capsys):
+    interrupted_at(IN_A_FRAME, FOURTH)
+    assert main(command(inputs, tmp_path / "run")) == 130
+    assert capsys.readouterr().err.endswith("interrupted; the frames tracked so far are kept in the run folder\n")
+    assert load_run(tmp_path / "run").frames.tolist() == [20, 21, 22, 23]
+    assert (tmp_path / "run" / "augmented.mp4").is_file()
+
+
+def test_a_second_ctrl_c_ends_it_at_once_and_loses_nothing_before(inputs, tmp_path, interrupted_at, capsys):
+    interrupted_at(IN_A_FRAME, FOURTH, times=2)
+    assert main(command(inputs, tmp_path / "run")) == 130
+    assert capsys.readouterr().err.endswith("interrupted; the frames tracked so far are kept in the run folder\n")
+    assert load_run(tmp_path / "run").frames.tolist() == [20, 21, 22]
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_ctrl_c_while_results_are_written_waits_for_them(is_first, inputs, tmp_path, interrupted_at, capsys):
+    if not is_first:
+        interrupted_at(IN_A_FRAME, FOURTH)
+    interrupted_at(WRITING, (1,), times=3)
+    assert main(command(inputs, tmp_path / "run", "--no-video")) == 130
+    printed = capsys.readouterr()
+    assert printed.err.count("writing what was tracked ...") == 1
+    assert printed.err.endswith("interrupted; the frames tracked so far are kept in the run folder\n")
+    assert f"wrote {tmp_path / 'run'}" in printed.out
+    assert load_run(tmp_path / "run").frames.tolist() == list(range(20, 27 if is_first else 24))
+    assert (tmp_path / "run" / "plots" / "parameters.png").is_file()
+    assert main(["evaluate", str(tmp_path / "run"), "--trajectory", str(tmp_path / "run" / "trajectory.txt")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("place", "calls", "frames"), [(REFINING, (1,), range(20, 27)), (IN_A_FRAME, (10,), range(20, 21))]
+)
+def test_ctrl_c_between_two_passes_keeps_one_of_them(place, calls, frames, inputs, tmp_path, interrupted_at, capsys):
+    """The second pass, once it has begun."""
+    interrupted_at(place, calls)
+    assert main(command(inputs, tmp_path / "run", "--refine", "--no-video")) == 130
+    assert "interrupted; the frames tracked so far are kept" in capsys.readouterr().err
+    assert load_run(tmp_path / "run").frames.tolist() == list(frames)
+
+
+def test_ctrl_c_while_the_video_is_drawn_leaves_the_rest_of_it_out(inputs, tmp_path, interrupted_at, capsys):
+    interrupted_at(DRAWING, (4,))
+    assert main(command(inputs, tmp_path / "run")) == 130
+    assert f"wrote {tmp_path / 'run'}" in capsys.readouterr().out
+    assert load_run(tmp_path / "run").frames.tolist() == list(range(20, 27))
+    capture = cv2.VideoCapture(str(tmp_path / "run" / "augmented.mp4"))
+    assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
+    capture.release()
 
 
 def test_reference_may_lie_inside_the_range(inputs, tmp_path):

@@ -81,6 +81,13 @@ def test_wrong_usage_exits_2(arguments, refused):
     assert ": error: " in refused(*arguments)
 
 
+def lost_interrupt():
+    """What Python makes of an interrupt that compiled code went on after."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    return error
+
+
 def info_that_raises(monkeypatch, error):
     def fail(arguments):
         raise error
@@ -91,7 +98,11 @@ def info_that_raises(monkeypatch, error):
 
 @pytest.mark.parametrize(
     ("error", "status", "message"),
-    [(StudyError("mend it so"), 2, "morph: mend it so"), (KeyboardInterrupt(), 130, "interrupted; nothing was")],
+    [
+        (StudyError("mend it so"), 2, "morph: mend it so"),
+        (KeyboardInterrupt(), 130, "interrupted; nothing was"),
+        (lost_interrupt(), 130, "interrupted; nothing was"),
+    ],
 )
 def test_errors_and_interrupts_become_statuses(monkeypatch, capsys, error, status, message):
     assert info_that_raises(monkeypatch, error) == status
@@ -103,6 +114,7 @@ def test_errors_and_interrupts_become_statuses(monkeypatch, capsys, error, statu
     ("error", "status", "message"),
     [
         (KeyboardInterrupt(), 130, "morph: interrupted; nothing was tracked yet"),
+        (lost_interrupt(), 130, "morph: interrupted; nothing was tracked yet"),
         (StreamError("the port is taken"), 2, "morph: the port is taken"),
     ],
 )
@@ -147,7 +159,7 @@ def test_help_shows_arguments_in_groups(command, capsys):
     assert ("--refine" in shown) == (command == "track")
 
 
-@pytest.mark.parametrize("defect", [ZeroDivisionError, BrokenPipeError])
+@pytest.mark.parametrize("defect", [ZeroDivisionError, BrokenPipeError, SystemError])
 def test_defects_are_not_hidden(monkeypatch, defect):
     with pytest.raises(defect):
         info_that_raises(monkeypatch, defect)
@@ -164,14 +176,6 @@ def test_frame_ranges(text, expected):
 def test_wrong_frame_ranges(text, refused):
     command = ["track", "video.mp4", "--model", "m", "--camera", "c", "--landmarks", "l", "-o", "r"]
     assert "is not a range of frames such as 9-100" in refused(*command, f"--range={text}")
-
-
-@pytest.fixture
-def interruptible():
-    """As in a terminal; what a shell runs in the background ignores Ctrl-C, and so do the tests there."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("interruptible")
@@ -199,6 +203,28 @@ def test_an_interrupt_waits_until_a_module_is_imported(number, capsys, tmp_path,
     assert len(imported) == 1
     assert capsys.readouterr().err == "\nmorph: interrupted; one module is imported\n"
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupt_waits_for_what_compiled_code_calls_back():
+    """Code that numba compiled takes no notice of errors of numba's own functions that it calls."""
+
+    class Interrupting:
+        def __reduce__(self):
+            signal.raise_signal(signal.SIGINT)
+            return str, ()
+
+    called = []
+
+    def action(_):
+        from numba.core.serialize import dumps
+
+        called.append(dumps(Interrupting()))
+        time.sleep(30.0)
+        called.append("not interrupted")
+
+    assert cli.run_and_report_errors(action, argparse.Namespace(), "") == 130
+    assert len(called) == 1
 
 
 @pytest.mark.usefixtures("interruptible")

@@ -12,6 +12,7 @@ from matplotlib.colors import Normalize
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import ExportError, ParameterError
+from morph_dslam.extend.studies import build_rigid
 from morph_dslam.io.export import StateChoice, export
 from morph_dslam.io.gltf import FRAMES_PER_SECOND
 from morph_dslam.meshing.generators import block
@@ -296,6 +297,7 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
         ({"vary": ["slide=0:1:2", "slide=0:1:2"]}, "'slide' has a range already"),
         ({"vary": ["slide=0:1:1000000000"]}, "10000 is the most"),
         ({"vary": ["slide=0:1:101", "stretch=0:0.1:101"]}, "make 10201 states"),
+        ({"at": ["slide=5", "slide=0.6 cm"]}, "--at slide=5 and --at slide=0.6 cm both set 'slide'"),
         ({"at": ["slide"]}, "--at slide is not a parameter and its value, such as stretch=-0.2"),
         ({"at": ["slide=x"]}, "--at slide=x: 'x' is not a value of slide: write a number in mm, or with another unit"),
         ({"at": ["slide=2 cm"]}, "--at slide=2 cm: 20 is outside the range of slide, -10 to 10 mm"),
@@ -303,6 +305,8 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
         ({"vary": ["slide=0:1:2"], "path": "p.csv"}, "give one of them"),
         ({"path": "absent.csv"}, r"cannot read the path .*absent\.csv"),
         ({"path": ("a,b\n1,2\n",)}, r"no column of a parameter; name the columns 'stretch \[1\]', 'slide"),
+        ({"path": ("slide_mm,slide [mm]\n1,2\n",)}, r"columns 'slide_mm' and 'slide \[mm\]' both hold 'slide'"),
+        ({"path": ("slide_mm,slide_mm\n1,2\n",)}, "columns 'slide_mm' and 'slide_mm' both hold 'slide'"),
         ({"path": ("slide_mm\n1\nmany\n",)}, r"line 3: 'many' is not a value of slide"),
         ({"path": ("slide_mm\n1\n12\n",)}, r"line 3: 12 is outside the range of slide"),
         ({"path": ("slide_mm,frame\n,1\n",)}, "holds 0 states"),
@@ -356,6 +360,45 @@ def test_a_shorter_series_leaves_no_state_of_the_one_before(tmp_path):
     assert export(model, tmp_path, "vtu", [0.1, 0.0]) == tmp_path / "a_b_c.pvd"
     expected = {"a_b_c.pvd", "a_b_c_0000.vtu", "a_b_c_0007.vtu", "a_b_c_d_0002.vtu", "states.csv"}
     assert {path.name for path in tmp_path.iterdir()} == expected
+
+
+FILES = {"xdmf": {"NAME.xdmf", "NAME.h5"}, "vtu": {"NAME.pvd", "NAME_0000.vtu", "NAME_0001.vtu"}, "gltf": {"NAME.glb"}}
+
+
+@pytest.mark.parametrize("before", FILES)
+@pytest.mark.parametrize("after", FILES)
+def test_an_export_replaces_the_one_before_in_whatever_format(before, after, tmp_path):
+    """Of another model nothing is touched but the table."""
+    model = stretched_block_model()
+    export(replace(model, name="other"), tmp_path, before, np.zeros((2, 2)))
+    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.name != "states.csv"}
+    named = replace(model, name="block")
+    export(named, tmp_path, before, np.zeros((2, 2)))
+    export(named, tmp_path, after, np.zeros((2, 2)))
+    left = {path.name for path in tmp_path.iterdir()} - {"states.csv"} - kept.keys()
+    assert left == {name.replace("NAME", "block") for name in FILES[after]}
+    assert kept == {name: (tmp_path / name).read_bytes() for name in kept}
+
+
+@pytest.mark.parametrize("file_format", FILES)
+def test_files_of_other_programs_stay_beside_an_export_of_their_name(file_format, tmp_path):
+    """A series by meshio itself, a collection of other files, an animation without our mark."""
+    names = {name.replace("NAME", "block") for form, files in FILES.items() if form != file_format for name in files}
+    for name in names:
+        (tmp_path / name).write_text('<DataSet file="others/block_0000.vtu"/><Grid Name="mine">block.h5:/data0</Grid>')
+    export(replace(stretched_block_model(), name="block"), tmp_path, file_format, np.zeros((2, 2)))
+    assert names < {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_model_without_parameters_has_no_path(tmp_path, refused):
+    body = stretched_block_model()
+    meshio.Mesh(body.nodes, [("triangle", body.triangles)]).write(tmp_path / "box.obj")
+    build_rigid(tmp_path / "box.obj", "m", tmp_path / "box.morph")
+    (tmp_path / "frames.csv").write_text("frame,x_mm\n0,1\n")
+    options = ("-o", tmp_path / "out", "--path", tmp_path / "frames.csv")
+    assert "has no parameters, and so one state only: leave --path out" in refused(
+        "export", tmp_path / "box.morph", *options
+    )
 
 
 def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, refused):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.force import ForceCurve, load_curve
+from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from tests.support.bent_sheet import bent_sheet_model
 
 MODEL = bent_sheet_model(3, 3)

@@ -9,7 +9,7 @@ import pytest
 import morph_dslam as md
 from morph_dslam.cli.app import main
 from morph_dslam.errors import EvaluationError
-from morph_dslam.extend.reports import ForceCurve, evaluate_force
+from morph_dslam.extend.reports import ForceCurve, evaluate_force, force_remarks
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
 from tests.support.bent_sheet import bent_sheet_model
@@ -130,6 +130,43 @@ def test_a_small_force_across_the_main_one_is_a_force():
     run = replace(pulled_run(), model=small)
     figures = evaluate_force(run, ForceCurve("frame", np.arange(10.0), pull(ARCHES)), reaction="clamp:y")
     assert figures["factor"] == pytest.approx(1e3)
+
+
+def test_a_measured_force_that_does_not_change_gives_no_factor():
+    for force in (5.0, 0.0):
+        with pytest.raises(EvaluationError, match=f"the measured force is {force:g} N in all frames"):
+            evaluate_force(pulled_run(), ForceCurve("frame", np.arange(10.0), np.full(10, force)))
+
+
+def stating(relative, mesh=None):
+    """The run of a model that states the relative error of its reduction, and of its mesh."""
+    errors = {} if mesh is None else {"errors": {"reaction_force_clamp": {"relative_l2": mesh}}}
+    stated = {"reaction_force_clamp": {"relative_l2": relative, "largest_N": 10.0}, "discretisation": errors}
+    return replace(pulled_run(), model=replace(model(), certificate=stated))
+
+
+@pytest.mark.parametrize(("relative", "mesh"), [(0.05, None), (0.01, 0.04)])
+def test_a_force_that_may_change_by_error_alone_gives_no_factor(relative, mesh):
+    """Along y it changes by a tenth of what it does along x, 0.39 N; two states may miss by 0.5 N each."""
+    run, curve = stating(relative, mesh), ForceCurve("frame", np.arange(10.0), pull(ARCHES))
+    with pytest.raises(EvaluationError, match=r"may be off by 1 N by the .*: write --reaction clamp:x"):
+        evaluate_force(run, curve, reaction="clamp:y")
+    figures = evaluate_force(run, curve, reaction="clamp:x")
+    assert figures["own_error_of_model_N"] == pytest.approx(1.0)
+    assert figures["change_of_model_N"] == pytest.approx(np.ptp(pull(ARCHES)))
+    assert len(force_remarks(figures)) == 1
+
+
+def test_a_force_that_changes_by_more_than_its_error_gives_a_factor():
+    curve = ForceCurve("frame", np.arange(10.0), pull(ARCHES))
+    assert evaluate_force(stating(0.015), curve, reaction="clamp:y")["factor"] == pytest.approx(10.0)
+
+
+def test_where_no_axis_has_more_a_note_says_that_the_factor_means_little():
+    curve = ForceCurve("frame", np.arange(10.0), pull(ARCHES))
+    figures = evaluate_force(stating(0.5), curve)
+    assert (figures["factor"], figures["own_error_of_model_N"]) == pytest.approx((1.0, 10.0))
+    assert "may be off by 10 N by the model's own error" in force_remarks(figures)[1]
 
 
 def test_a_force_that_does_not_change_gives_no_factor():

@@ -14,7 +14,8 @@ from scipy.stats import t
 from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError, IdentificationError
-from morph_dslam.evaluation.force import ForceCurve, load_curve, reaction_in_direction
+from morph_dslam.evaluation.force import reaction_in_direction
+from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import FACTOR, identify
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints, load_points

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.points import bind_truth, load_truth, material_error, summarise
+from morph_dslam.evaluation.points import PointTruth, bind_truth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.trajectory import summarise_alignment
 from morph_dslam.geometry import rotation_exp
@@ -102,12 +102,25 @@ def test_unmeasured_points_are_left_out_and_counted(tracked, compare):
     assert figures["mean_mm"] < 1e-4
 
 
-@pytest.mark.parametrize(("frame", "message"), [(8, "truth has no frame 8"), (12, r"not tracked \(too few points\)")])
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (8, "truth has no frame 8 to bind in; it has 10, 11, 12, 13, 14 and 15$"),
+        (12, r"not tracked \(too few points\)"),
+    ],
+)
 def test_binding_frame_must_be_known(tmp_path, frame, message):
     model = write_run(tmp_path, ["tracked", "tracked", "lost", "tracked", "tracked", "tracked"])
     truth = saved(tmp_path / "truth.npz", exact_truth(model))
     with pytest.raises(EvaluationError, match=message):
         material_error(load_run(tmp_path), truth, frame)
+
+
+def test_of_many_frames_a_message_gives_the_range(tracked):
+    points, pixels, hidden = np.zeros((150, 1, 3)), np.zeros((150, 1, 2)), np.zeros((150, 1), dtype=bool)
+    many = PointTruth(np.arange(150), points, pixels, hidden)
+    with pytest.raises(EvaluationError, match=r"has no frame 5000 to bind in; it has 150 frames from 0 to 149$"):
+        material_error(tracked[0], many, 5000)
 
 
 @pytest.mark.parametrize(

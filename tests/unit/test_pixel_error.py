@@ -101,9 +101,19 @@ def test_frames_that_cannot_be_compared_are_counted():
     assert figures["track_frames_outside_the_run"] == [99]
     assert figures["per_track"]["a"]["bind_frame"] == 21
     assert (figures["n_frames_tracked"], figures["n_frames"]) == (5, 6)
-    for frame, message in ((20, "not tracked"), (99, "not in the run"), (25, "has no track")):
+    for frame, message in ((20, "not tracked"), (99, "not in the run"), (25, "no track is measured in frame 25")):
         with pytest.raises(EvaluationError, match=message):
             evaluate_pixels(run, tracks(projected(), frames), frame)
+
+
+def test_a_frame_that_binds_nothing_is_refused_with_those_that_would():
+    """Lines without pixels, as of a point that is hidden, measure nothing."""
+    pixels = projected()
+    pixels[3:5] = np.nan
+    with pytest.raises(
+        EvaluationError, match=r"no track is measured in frame 23: .*measurements \(20, 21, 22 and 25\)"
+    ):
+        evaluate_pixels(sliding_run(), tracks(pixels), 23)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from importlib import import_module
 
 from morph_dslam._version import __version__
 from morph_dslam.cli.arguments import with_signed_sections
-from morph_dslam.cli.interruption import Interruption
+from morph_dslam.cli.interruption import Interruption, interrupt_behind
 from morph_dslam.errors import MorphError
 
 #: Commands in the order in which `morph --help` lists them.
@@ -78,7 +78,10 @@ def run_and_report_errors(
     except MorphError as error:
         print(f"morph: {error}", file=sys.stderr)
         return USER_ERROR
-    except KeyboardInterrupt as interrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        interrupt = interrupt_behind(error)
+        if interrupt is None:
+            raise
         print(f"\nmorph: interrupted; {interrupt if interrupt.args else kept}", file=sys.stderr)
         return INTERRUPTED
     return 0

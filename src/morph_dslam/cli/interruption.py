@@ -11,8 +11,9 @@ from types import FrameType, TracebackType
 from typing import Any
 
 #: What is done as a whole, by the names of Python's own files: a compiled module whose import is interrupted fails with
-#: an error of its own, a pool whose processes are just being started waits for ever.
-WHOLE = ("<frozen importlib", "concurrent/futures/process.py")
+#: an error of its own, a pool whose processes are just being started waits for ever, and code that numba compiled goes
+#: on after an error in what it calls back.
+WHOLE = ("<frozen importlib", "concurrent/futures/process.py", "numba/core/serialize.py")
 #: An interrupt that meets one of these comes again after so many seconds.
 LATER_S = 0.05
 
@@ -89,3 +90,15 @@ class Interruption:
             yield
         finally:
             sys.unraisablehook, sys.excepthook = unraisable, uncaught
+
+
+def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
+    """The interrupt that an error is, or that it came from; None if there is none.
+
+    Compiled code that calls Python back may go on after an error there. What comes of an interrupt is then a
+    SystemError.
+    """
+    at: BaseException | None = error
+    while at is not None and not isinstance(at, KeyboardInterrupt):
+        at = at.__cause__ or at.__context__
+    return at

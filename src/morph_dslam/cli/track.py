@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morph_dslam.cli.arguments import add_file, add_flag, add_repeated
+from morph_dslam.cli.interruption import interrupt_behind
 from morph_dslam.cli.tracking_arguments import add_tracking_arguments
 from morph_dslam.errors import TrackingError
 
@@ -96,8 +97,8 @@ def track_and_print(options: TrackOptions) -> None:
 
     try:
         track(options, tell)
-    except KeyboardInterrupt:
-        if written:
+    except (KeyboardInterrupt, SystemError) as error:
+        if written or interrupt_behind(error) is None:
             raise
         raise KeyboardInterrupt("nothing was tracked yet") from None
     finally:

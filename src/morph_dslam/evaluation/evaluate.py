@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_depth
-from morph_dslam.evaluation.force import ForceCurve, force_error, load_curve, summarise_force
+from morph_dslam.evaluation.force import force_error, summarise_force
+from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run

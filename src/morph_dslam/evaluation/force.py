@@ -9,62 +9,25 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.force_curves import LEAST, ForceCurve
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.io.text import read_csv
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE
-from morph_dslam.units import FACTORS
+from morph_dslam.model.stated_errors import largest_force_error
 
 Array = NDArray[np.float64]
-#: Fewer comparisons determine no factor and offset with anything left over.
-LEAST = 3
 #: Changes of a force below this share of it are rounding.
 ROUNDING = 1e-9
 #: A component below this share of a support's largest force is rounding, as where models are built; in so many states
 #: beside the default.
 NEGLIGIBLE, SAMPLES = 1e-6, 32
-_GRAM, _POUND = 9.80665e-3, 4.4482216152605
-#: Newtons in each unit of a column of forces. Units of mass stand for weights here, as on the display of a load cell.
-FORCE_UNITS = {
-    **FACTORS["force"],
-    **{"uN": 1e-6, "MN": 1e6, "gf": _GRAM, "g": _GRAM, "kgf": 1e3 * _GRAM, "kg": 1e3 * _GRAM},
-    **{"lbf": _POUND, "lb": _POUND, "ozf": _POUND / 16.0, "oz": _POUND / 16.0},
-}
-#: Ends of names, in any case, that mean other units or spell one otherwise. Specimens have letters, so that one letter
-#: is no unit; nor are times and angles here, for force_min and force_rad are forces.
-_OTHER_UNITS = {
-    *(unit.lower() for unit in FORCE_UNITS if len(unit) > 1),
-    *(unit.lower() for name in FACTORS if name not in ("time", "angle") for unit in FACTORS[name] if len(unit) > 1),
-    *("dyn", "kp", "kip", "kips", "tf", "ton", "tons", "lbs", "grams", "pounds"),
-    *("nm", "nmm", "psi", "mv", "uv", "volt", "volts"),
-}
-_BRACKETED = re.compile(r"(.*\S)\s*\[(.+)\]")
 _REACTION = re.compile(r"(?P<support>.+?)(?::(?P<sign>[+-]?)(?P<axis>[xyz]))?")
-
-
-@dataclass(frozen=True)
-class ForceCurve:
-    """Measured forces.
-
-    Attributes
-    ----------
-    against : "frame", or the name of a parameter of the model.
-    places : (k,) frame numbers, or values of the parameter, SI.
-    forces : (k,) newtons.
-    name : of the forces, for plots.
-    """
-
-    against: str
-    places: Array
-    forces: Array
-    name: str = "force"
 
 
 @dataclass(frozen=True)
@@ -145,118 +108,6 @@ def _reaction(model: ReducedModel, support: str, axis: str, sign: str | None) ->
     return ReactionInDirection(support, field, at, -1.0 if sign == "-" else 1.0, literal=bool(sign))
 
 
-def load_curve(path: str | Path, model: ReducedModel, column: str | None = None) -> ForceCurve:
-    """Read a curve: CSV whose first column is ``frame``, or a parameter with its unit, ``stroke_mm`` or
-    ``stroke [mm]`` say.
-
-    The other columns are forces with their unit, ``force_N`` say, in newtons where they name none.
-
-    Parameters
-    ----------
-    path : the file. Lines without a force are left out.
-    model : whose parameters the first column may name.
-    column : which column of forces; needed where there are several.
-
-    Raises
-    ------
-    EvaluationError
-        If the file is missing, a column is not known, its unit is none of force, or a value is no number.
-    """
-    (_, titles), *rows = _table(path)
-    against, scale = _place(path, titles[0], model)
-    column = _column(path, titles, column)
-    newtons, at = _newtons(path, column), titles.index(column, 1)
-    for line, cells in rows:
-        if len(cells) > len(titles):
-            raise EvaluationError(
-                f"{path}, line {line}: {len(cells)} cells under {len(titles)} titles; write decimals with points"
-            )
-    values = np.array([_numbers(f"{path}, line {line}", cells, at) for line, cells in rows]).reshape(-1, 2)
-    values = values[np.isfinite(values).all(axis=1)]
-    if len(values) < LEAST:
-        raise EvaluationError(f"{path} has {len(values)} forces in column '{column}': give at least {LEAST}")
-    return ForceCurve(against, scale * values[:, 0], newtons * values[:, 1], column)
-
-
-def _table(path: str | Path) -> list[tuple[int, list[str]]]:
-    """Line numbers and cells of the lines that hold any, without empty cells at their ends; the titles are first."""
-    rows = read_csv(Path(path), "force curve", EvaluationError)
-    return [(line, cells[: max(i for i, cell in enumerate(cells) if cell) + 1]) for line, cells in rows] or [(1, [""])]
-
-
-def _column(path: str | Path, titles: Sequence[str], asked: str | None) -> str:
-    """The column of forces that is asked for, or the only one."""
-    columns = [title for title in titles[1:] if title]
-    if not columns:
-        raise EvaluationError(
-            f"{path} has no column of forces: give one beside '{titles[0]}', with its unit, as {titles[0]},force_N"
-        )
-    if asked is None and len(columns) == 1:
-        return columns[0]
-    if asked in columns:
-        return asked
-    wrong = "several columns of forces" if asked is None else f"no column '{asked}'"
-    others = f"; the others are {', '.join(columns[1:])}" if len(columns) > 1 else ""
-    raise EvaluationError(f"{path} has {wrong}; name one that it has, as {path}:{columns[0]}{others}")
-
-
-def _newtons(path: str | Path, column: str) -> float:
-    """Newtons in the unit that the name of a column ends in; 1 if it ends in none."""
-    unit = name_and_unit(column)[1]
-    if unit not in FORCE_UNITS and unit.lower() in _OTHER_UNITS:
-        raise EvaluationError(
-            f"{path}: column '{column}' ends in '{unit}', which is no unit of force that is known: give one of "
-            f"{', '.join(FORCE_UNITS)}"
-        )
-    return FORCE_UNITS.get(unit, 1.0)
-
-
-def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, float]:
-    """What the first column is, and the factor of its values to SI."""
-    if header == "frame":
-        return header, 1.0
-    found = parameter_of_column(header, model)
-    if found is None:
-        raise EvaluationError(
-            f"{path}: the first column is '{header}'; name it frame, or as a parameter of the model with its unit: "
-            f"{parameter_columns(model)}"
-        )
-    return found
-
-
-def name_and_unit(header: str) -> tuple[str, str]:
-    """Both parts of a column's header, "stroke_mm" or "stroke [mm]"."""
-    if bracketed := _BRACKETED.fullmatch(header):
-        return bracketed[1], bracketed[2]
-    name, _, unit = header.rpartition("_")
-    return name, unit
-
-
-def parameter_of_column(header: str, model: ReducedModel) -> tuple[str, float] | None:
-    """The parameter that a column such as ``stroke_mm`` holds, and the factor of its values to SI; None if none."""
-    name, unit = name_and_unit(header)
-    for parameter in model.parameters:
-        if parameter.name == name and unit in FACTORS[parameter.quantity]:
-            return name, FACTORS[parameter.quantity][unit]
-    return None
-
-
-def parameter_columns(model: ReducedModel) -> str:
-    """How columns with the model's parameters are named, for messages."""
-    return ", ".join(f"{parameter.name}_{parameter.unit}" for parameter in model.parameters)
-
-
-def _numbers(where: str, row: Sequence[str], at: int) -> tuple[float, float]:
-    """A place and a force of one line, NaN where the line has none."""
-    try:
-        found = float(row[0]), float((row[at] if at < len(row) else "") or "nan")
-    except ValueError:
-        found = np.inf, np.inf
-    if np.isinf(found).any():
-        raise EvaluationError(f"{where}: '{','.join(row)}' is not a place on the curve and its forces, all numbers")
-    return found
-
-
 @dataclass(frozen=True)
 class ForceError:
     """Measured forces and those of the model, in newtons.
@@ -273,6 +124,7 @@ class ForceError:
     factor, offset : that make ``factor * modelled + offset`` fit the measurement best.
     factor_std : standard deviation of the factor, from what the fit leaves.
     left_out : tracked frames that the curve does not have, or not in its range.
+    own_error : a smaller change of the model's force may be its own error; 0 if the model states none.
     axis : factor from ``places`` to what a plot shows, and its label.
     """
 
@@ -287,6 +139,7 @@ class ForceError:
     offset: float
     factor_std: float
     left_out: tuple[int, ...]
+    own_error: float = 0.0
     axis: tuple[float, str] = (1.0, "frame")
 
     @property
@@ -307,8 +160,9 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
     Raises
     ------
     EvaluationError
-        If fewer than three tracked frames lie on the curve, or the model has no such force, one that does not change,
-        or one that falls where the measured force grows.
+        If fewer than three tracked frames lie on the curve, the measured force does not change, or the model has no
+        such force, one that does not change or changes by less than the model errs, or one that falls where the
+        measured force grows.
     """
     rows = np.flatnonzero(run.tracked)
     places, measured = _on_curve(run, curve, rows)
@@ -333,6 +187,7 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
         offset=offset,
         factor_std=deviation,
         left_out=tuple(left_out.tolist()),
+        own_error=_own_error(run.model, compared.support),
         axis=_axis(run.model, curve.against),
     )
 
@@ -382,8 +237,26 @@ def _modelled(
     reaction = _reaction(run.model, support, axis or largest, sign)
     reaction = reaction.following(force[:, reaction.axis], measured)
     modelled = reaction.sign * force[:, reaction.axis]
+    _check_change(reaction, np.ptp(force, axis=0), _own_error(run.model, support))
     reaction.check_growth(modelled, measured)
     return reaction, modelled, float(np.linalg.norm(force, axis=1).max())
+
+
+def _own_error(model: ReducedModel, support: str) -> float:
+    """What a force on a support may change by from nothing but error: that of both states, as stated."""
+    return 2.0 * largest_force_error(model, support)
+
+
+def _check_change(reaction: ReactionInDirection, changes: Array, own_error: float) -> None:
+    """Refuse an axis along which a force with changes (3,) may change by error alone, where another one has more."""
+    change, most = changes[reaction.axis], int(changes.argmax())
+    if change < own_error <= changes[most]:
+        axis, other = "xyz"[reaction.axis], f"{reaction.support}:{'xyz'[most]}"
+        raise EvaluationError(
+            f"the model's force on '{reaction.support}' along {axis} changes by {change:.3g} N in the frames compared, "
+            f"and may be off by {own_error:.3g} N by the model's own error: no factor can be found. It changes by "
+            f"{changes[most]:.3g} N along {'xyz'[most]}: write --reaction {other}"
+        )
 
 
 def _most_loaded(run: Run, rows: NDArray[np.integer]) -> str:
@@ -421,6 +294,11 @@ def _fit(modelled: Array, measured: Array, size: float) -> tuple[float, float, f
 
     ``size`` is the support's largest force: what changes by less than its rounding does not change.
     """
+    if not np.ptp(measured) > ROUNDING * np.abs(measured).max():
+        raise EvaluationError(
+            f"the measured force is {measured[0]:.6g} N in all frames compared: no factor can be found. Compare frames "
+            "in which the load grows, or name another column of forces (--force FILE:COLUMN)"
+        )
     centred = modelled - modelled.mean()
     spread = float(centred @ centred)
     if not spread > (ROUNDING * size) ** 2 * len(modelled):
@@ -453,6 +331,8 @@ def summarise_force(error: ForceError) -> dict[str, Any]:
         "relative_rms": rms / max(float(np.ptp(error.measured)), 1e-300),
         "largest_N": float(np.abs(error.residuals).max()),
         "rms_without_fit_N": _rms(error.modelled - error.measured),
+        "change_of_model_N": float(np.ptp(error.modelled)),
+        "own_error_of_model_N": error.own_error,
         "largest_measured_N": float(np.abs(error.measured).max()),
         "frames_compared": error.frames.tolist(),
         "tracked_frames_off_the_curve": list(error.left_out),
@@ -472,6 +352,11 @@ def summarise_force(error: ForceError) -> dict[str, Any]:
 def force_remarks(figures: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures must know: which reaction it is, and frames that were not compared."""
     lines = [reaction_remark(figures)]
+    if figures["change_of_model_N"] < figures["own_error_of_model_N"]:
+        lines.append(
+            f"the model's force changes by {figures['change_of_model_N']:.3g} N in the frames compared, and may be off "
+            f"by {figures['own_error_of_model_N']:.3g} N by the model's own error: the factor says little"
+        )
     if frames := figures["tracked_frames_off_the_curve"]:
         lines.append(f"{len(frames)} tracked frames are not on the curve and were not compared: {_some(frames)}")
     return lines

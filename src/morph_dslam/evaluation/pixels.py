@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.points import OUTLINE_TOLERANCE_PX, bind_pixels, millimetres
+from morph_dslam.evaluation.points import OUTLINE_TOLERANCE_PX, bind_pixels, frames_in_words, millimetres
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.io.text import read_csv
 from morph_dslam.model import SurfacePoints
@@ -155,7 +155,7 @@ def pixel_error(run: Run, tracks: PixelTracks, bind_frame: int | None = None) ->
     if not compared.size:
         raise EvaluationError(
             "no track was measured in a second frame that can be compared: "
-            f"not tracked {list(untracked) or 'none'}, outside the run {list(outside) or 'none'}"
+            f"not tracked {frames_in_words(untracked)}, outside the run {frames_in_words(outside)}"
         )
     points = points.take(columns)
     masked = np.where(seen[..., None], recorded, np.nan)[:, columns]
@@ -181,12 +181,16 @@ def _starts(run: Run, frames: NDArray[np.int64], seen: NDArray[np.bool_], bind_f
     if bind_frame is None:
         return np.where(seen.any(axis=0), seen.argmax(axis=0), -1) if len(seen) else np.full(seen.shape[1], -1)
     found = np.flatnonzero(frames == bind_frame)
-    if not found.size:
-        row = run.row(bind_frame)
-        why = "is not in the run" if row is None else "has no track"
-        if row is not None and not run.tracked[row]:
-            why = f"was not tracked ({run.reasons[row]})"
-        raise EvaluationError(f"frame {bind_frame} {why}: bind in another frame, or leave --bind-frame out")
+    if not found.size or not seen[found[0]].any():
+        row, measured = run.row(bind_frame), frames_in_words(frames[seen.any(axis=1)])
+        why = f"no track is measured in frame {bind_frame}"
+        if row is None:
+            why = f"frame {bind_frame} is not in the run"
+        elif not run.tracked[row]:
+            why = f"frame {bind_frame} was not tracked ({run.reasons[row]})"
+        raise EvaluationError(
+            f"{why}: bind in a frame that was tracked and has measurements ({measured}), or leave --bind-frame out"
+        )
     return np.where(seen[found[0]], found[0], -1)
 
 
@@ -208,7 +212,7 @@ def _nothing_bound(starts: NDArray[np.int64], untracked: Sequence[int], outside:
     if (starts < 0).all():
         return (
             "no track was measured in a frame in which it could be bound: "
-            f"not tracked {list(untracked) or 'none'}, outside the run {list(outside) or 'none'}"
+            f"not tracked {frames_in_words(untracked)}, outside the run {frames_in_words(outside)}"
         )
     return (
         "no track begins on the estimated surface: are its pixels those of the recorded images, with (0, 0) the "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,8 @@ def load_truth(path: str | Path) -> PointTruth:
 
 #: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.
 OUTLINE_TOLERANCE_PX = 5.0
+#: More frames than these are not named one by one in messages.
+MOST_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -165,12 +168,22 @@ def bind_pixels(run: Run, row: int, recorded: Array) -> tuple[SurfacePoints, int
     return points, int(close.sum())
 
 
+def frames_in_words(frames: Iterable[int]) -> str:
+    """Frame numbers, "0, 10 and 20" say; of many, how many there are and of what range."""
+    numbers = sorted(map(int, frames))
+    if not numbers:
+        return "none"
+    if len(numbers) > MOST_NAMED:
+        return f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]}"
+    *others, last = map(str, numbers)
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     """Bind truth points to the mesh by their pixels in ``frame``, in the state estimated there."""
     in_truth = np.flatnonzero(truth.frames == frame)
     if not in_truth.size:
-        known = ", ".join(str(number) for number in truth.frames)
-        raise EvaluationError(f"the truth has no frame {frame} to bind in; it has {known}")
+        raise EvaluationError(f"the truth has no frame {frame} to bind in; it has {frames_in_words(truth.frames)}")
     row = run.row(frame)
     if row is None:
         raise EvaluationError(f"the run has no frame {frame} to bind in; it has {run.frames[0]} to {run.frames[-1]}")
@@ -211,7 +224,7 @@ def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialErro
     if not frames or not np.isfinite(vectors).any():
         raise EvaluationError(
             f"no truth frame besides {bind_frame} can be compared: "
-            f"not tracked {untracked or 'none'}, outside the run {outside or 'none'}"
+            f"not tracked {frames_in_words(untracked)}, outside the run {frames_in_words(outside)}"
         )
     return MaterialError(
         binding,

@@ -3,12 +3,11 @@
 from morph_dslam.evaluation.depth import distances_to_surface as distances_to_surface
 from morph_dslam.evaluation.evaluate import evaluate_force as evaluate_force, evaluate_pixels as evaluate_pixels
 from morph_dslam.evaluation.force import (
-    ForceCurve as ForceCurve,
     force_line as force_line,
     force_remarks as force_remarks,
-    load_curve as load_curve,
     reaction_in_direction as reaction_in_direction,
 )
+from morph_dslam.evaluation.force_curves import ForceCurve as ForceCurve, load_curve as load_curve
 from morph_dslam.evaluation.model_summary import error_facts as error_facts, summarise_model as summarise_model
 from morph_dslam.evaluation.pixels import (
     PixelError as PixelError,

@@ -16,13 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.evaluation.force import (
-    ForceCurve,
-    ReactionInDirection,
-    name_and_unit,
-    parameter_columns,
-    parameter_of_column,
-)
+from morph_dslam.evaluation.force import ReactionInDirection
+from morph_dslam.evaluation.force_curves import ForceCurve, name_and_unit, parameter_columns, parameter_of_column
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.io.text import read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel

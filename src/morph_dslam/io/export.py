@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import ExportError, StudyError
-from morph_dslam.io.gltf import Colours, write_glb
+from morph_dslam.io.gltf import GENERATOR, Colours, write_glb
 from morph_dslam.io.text import read_csv
 from morph_dslam.model import Parameter, ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
@@ -55,12 +55,15 @@ def _in_range(parameter: Parameter, si: float, where: str) -> float:
 
 def fixed_values(model: ReducedModel, settings: Sequence[str]) -> Array:
     """The parameters (d,) with some of them set by texts "name=value"; the others keep their defaults."""
-    mu = model.default
+    mu, given = model.default, dict[str, str]()
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals:
             raise ExportError(f"--at {text} is not a parameter and its value{_example(model, '{0}={1}')}")
         k = _index(model, name)
+        if name in given:
+            raise ExportError(f"--at {given[name]} and --at {text} both set '{name}': give one of them")
+        given[name] = text
         mu[k] = _number(model.parameters[k], value, f"--at {text}")
     return mu
 
@@ -113,12 +116,17 @@ def read_path(model: ReducedModel, path: Path, base: Array) -> Array:
     of a run. Other columns are passed over, and so are rows without values: frames that were not tracked.
     Parameters without a column keep their value in ``base``.
     """
+    if not model.parameters:
+        raise ExportError(f"'{model.name}' has no parameters, and so one state only: leave --path out")
     (_, header), *rows = read_csv(path, "path", ExportError) or [(1, [])]
     columns = {}
     for k, p in enumerate(model.parameters):
-        found = [name for name in (f"{p.name} [{p.unit}]", f"{p.name}_{p.unit}") if name in header]
+        found = [column for column, name in enumerate(header) if name in (f"{p.name} [{p.unit}]", f"{p.name}_{p.unit}")]
+        if len(found) > 1:
+            titles = " and ".join(f"'{header[column]}'" for column in found)
+            raise ExportError(f"{path}: the columns {titles} both hold '{p.name}': leave one of them in")
         if found:
-            columns[k] = header.index(found[0])
+            columns[k] = found[0]
     if not columns:
         wanted = ", ".join(f"'{p.name} [{p.unit}]'" for p in model.parameters)
         raise ExportError(f"{path} has no column of a parameter; name the columns {wanted}")
@@ -202,6 +210,8 @@ _MESHIO_CELLS = {
 }  # fmt: skip
 #: Where the nine components of a symmetric tensor stand among xx, yy, zz, yz, xz, xy.
 _FULL_TENSOR = [0, 5, 4, 5, 1, 3, 4, 3, 2]
+#: By what series and animations of exports are known.
+_XDMF_SERIES, _GLB_GENERATOR = 'Name="TimeSeries_meshio"', f'"generator":"{GENERATOR} '
 
 
 def point_fields(model: ReducedModel, mu: Array) -> dict[str, ArrayLike]:
@@ -235,17 +245,39 @@ def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock
     return result
 
 
-def _remove_series(folder: Path, stem: str) -> None:
-    """Remove the states of a series of this name that was written before: they would pass for states of the next."""
-    series = folder / f"{stem}.pvd"
-    written = series.read_text(errors="replace") if series.is_file() else ""
-    for name in re.findall(rf'file="({re.escape(stem)}_\d{{4}}\.vtu)"', written):
-        (folder / name).unlink(missing_ok=True)
+#: How much of the beginning of a file tells whether an export has written it, characters.
+_HEAD = 4096
+
+
+def _remove_export(folder: Path, stem: str) -> None:
+    """Remove what an export of this name has written, in any format: it would pass for states of the next.
+
+    Files that others have written under these names are left alone.
+    """
+    series, collection, animation = (folder / f"{stem}.{ending}" for ending in ("xdmf", "pvd", "glb"))
+    written = [
+        folder / name for name in re.findall(rf'file="({re.escape(stem)}_\d{{4,}}\.vtu)"', _beginning(collection))
+    ]
+    found = [*written, collection] if written else []
+    head = _beginning(series, _HEAD)
+    if _XDMF_SERIES in head and f">{stem}.h5:/" in head:
+        found += [series, series.with_suffix(".h5")]
+    if _GLB_GENERATOR in _beginning(animation, _HEAD):
+        found.append(animation)
+    for path in found:
+        path.unlink(missing_ok=True)
+
+
+def _beginning(path: Path, length: int = -1) -> str:
+    """The first characters of a file, or all; nothing if there is no such file."""
+    if not path.is_file():
+        return ""
+    with path.open(errors="replace") as file:
+        return file.read(length)
 
 
 def write_vtu_series(folder: Path, stem: str, model: ReducedModel, states: Array) -> Path:
     """One ``stem_0000.vtu`` a state (s, d), ``stem.pvd`` to open all, ``states.csv``; returns the .pvd."""
-    _remove_series(folder, stem)
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
     cells, places = _cells(model), []
@@ -324,7 +356,7 @@ def export(
     Parameters
     ----------
     model : a model or its file.
-    folder : to write into; made if missing. Files of an export of the same name are replaced.
+    folder : to write into; made if missing. An export of the same name that is there is replaced, in whatever format.
     file_format : "xdmf" or "vtu" for ParaView, "gltf" for 3-D viewers.
     choice : of the states, by default each parameter in turn; or their parameters (s, d), SI.
     show : what colours a glTF file: "stress" (von Mises), "strain" (equivalent), "displacement", or "none"; by default
@@ -353,6 +385,7 @@ def export(
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _remove_export(folder, stem)
         if file_format == "gltf":
             target = folder / f"{stem}.glb"
             write_glb(target, loaded, states, show)

@@ -27,6 +27,8 @@ from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field,
 Array = NDArray[np.float64]
 Colours = Literal["stress", "strain", "displacement", "none"]
 
+#: What files call the program that wrote them; its version comes behind.
+GENERATOR = "morph-dslam"
 FRAMES_PER_SECOND = 12.0
 COLOUR_MAP = "turbo"
 #: Bytes of a vertex in one state: three floats, and a colour of four 16-bit numbers.
@@ -99,7 +101,7 @@ def write_glb(path: Path, model: ReducedModel, states: Array, show: Colours | No
     else:
         content = _coloured(buffer, model, states, shown_field(model, show))
     document = {
-        "asset": {"version": "2.0", "generator": f"morph-dslam {__version__}"},
+        "asset": {"version": "2.0", "generator": f"{GENERATOR} {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         **content,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
+from morph_dslam.interrupts import WaitingInterrupts
 
 #: MPEG-4 part 2: the wheels of OpenCV carry no H.264 encoder, and their VP9 takes 120 ms a frame.
 CODEC = "mp4v"
@@ -77,9 +78,10 @@ class VideoWriter:
     ) -> None:
         if self._writer is None:
             return
-        self._writer.release()
-        self._writer = None
-        if self.n_frames:
-            os.replace(self._partial, self._path)
-        else:
-            self._partial.unlink(missing_ok=True)
+        with WaitingInterrupts():
+            self._writer.release()
+            self._writer = None
+            if self.n_frames:
+                os.replace(self._partial, self._path)
+            else:
+                self._partial.unlink(missing_ok=True)

@@ -54,3 +54,10 @@ def force_error(model: ReducedModel, support: str) -> tuple[float, bool] | None:
         return None
     discretisation = model.certificate.get("discretisation", {}).get("errors", {}).get(name, {}).get("relative_l2")
     return reduction + (discretisation or 0.0), discretisation is not None
+
+
+def largest_force_error(model: ReducedModel, support: str) -> float:
+    """Error of the force on a support where that is largest, newtons; 0 if none is stated."""
+    stated = force_error(model, support)
+    largest = model.certificate.get(f"{REACTION}{FORCE}{support}", {}).get("largest_N")
+    return stated[0] * largest if stated is not None and largest is not None else 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,55 @@ from morph_dslam.tracking.run_folder import RunFolder
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
 
+#: The first line of a log is read to here at most: of other files it may be the whole file.
+_LONGEST_LINE = 1_000_000
+
+
+def check_frame_log(path: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a file that a log would empty though it holds something else.
+
+    Parameters
+    ----------
+    path : of the log. It may be missing or empty, or hold the log of an earlier run.
+    inputs : files that the run reads.
+
+    Raises
+    ------
+    TrackingError
+        If the file is one of the inputs, or holds something else than a log.
+    """
+    if not path.is_file():  # what is there may be a pipe too
+        return
+    try:
+        if any(given.exists() and given.samefile(path) for given in inputs):
+            raise TrackingError(
+                f"the frame log {path} is an input of this run, and would be emptied: name another file"
+            )
+        with path.open("rb") as file:
+            first = file.readline(_LONGEST_LINE)
+    except OSError as error:
+        raise TrackingError(f"cannot write {path}: {error.strerror or error}") from error
+    if first and not _is_line_of_log(first):
+        raise TrackingError(
+            f"the frame log {path} is there and holds something else, which would be gone: name another file, or "
+            "delete this one"
+        )
+
+
+def _is_line_of_log(line: bytes) -> bool:
+    try:
+        content = json.loads(line)
+    except ValueError:
+        return False
+    return isinstance(content, dict) and "frame" in content
+
 
 class FrameLog:
     """Appends a line of JSON for each frame that a run folder has taken in (docs/run-folder.md).
 
     Parameters
     ----------
-    path : file to write; what it held is gone.
+    path : file to write; what it held is gone: `check_frame_log` says whether it may be.
     folder : whose last frame is written; in a session's sinks it comes first.
 
     Raises

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from morph_dslam.interrupts import WaitingInterrupts
 from morph_dslam.sources.live import LiveStream, Newest
 from morph_dslam.threads import threads_side_by_side
 
@@ -42,17 +43,20 @@ class LivePipeline:
     def run(self, seconds: float | None = None) -> None:
         """Work until the stream ends, or for some seconds; raises what went wrong in a thread."""
         with threads_side_by_side():
-            for thread in self._threads:
-                thread.start()
             try:
+                with WaitingInterrupts():
+                    for thread in self._threads:
+                        thread.start()
                 end = None if seconds is None else time.monotonic() + seconds
                 # Not by joining: a thread whose join is interrupted counts as ended in Python 3.11.
                 while not self._done.wait(0.1) and (end is None or time.monotonic() < end):
                     pass
             finally:
-                self._stream.close()
-                for thread in self._threads:
-                    thread.join(timeout=10.0)
+                with WaitingInterrupts():  # what they hand out must not go on while it is written
+                    self._stream.close()
+                    for thread in self._threads:
+                        if thread.is_alive():
+                            thread.join(timeout=10.0)
         if self._errors:
             raise self._errors[0]
 

@@ -100,6 +100,16 @@ class TrackOptions(ObjectOptions):
         return (self, *(part for _, part in self.others))
 
     @property
+    def input_files(self) -> list[Path]:
+        """All files and folders that the run reads, whether they are there or not."""
+        found = [self.frames, str(self.camera).partition("#")[0], *self.other_cameras]
+        found += [self.map_path, self.reference_image]
+        for part in self.objects:
+            found += [part.model, part.landmarks, part.registration, *vars(part.initializer).values(), *part.inner]
+            found += [path for _, path in part.reregister_at]
+        return [Path(path) for path in found if path is not None]
+
+    @property
     def in_two_passes(self) -> bool:
         """Whether the recording is tracked again with what all of its frames tell."""
         still = any(part.tracker.pose == "still" for part in self.objects)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
+from morph_dslam.interrupts import WaitingInterrupts
 from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.folders import only_writer
 from morph_dslam.io.landmarks import Landmarks
@@ -33,7 +34,7 @@ from morph_dslam.tracking.combinations import check_depth, check_inputs, check_o
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, write_video
 from morph_dslam.tracking.frame_estimation import temporal_facts
-from morph_dslam.tracking.frame_log import FrameLog
+from morph_dslam.tracking.frame_log import FrameLog, check_frame_log
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain
@@ -69,7 +70,9 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
     """Track objects through a recording or a live stream, and write a run folder of each.
 
     An interrupt, or a recording that breaks off, keeps what was done: the run folders are completed with the
-    frames so far, and the exception goes on.
+    frames so far, and the exception goes on. An interrupt ends a recording between two frames; a further one, while no
+    frame comes, does so at once. While the folders are written interrupts wait, and one while the videos are drawn cuts
+    these short.
 
     Parameters
     ----------
@@ -100,7 +103,7 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
             try:
                 job.end_streams()
             finally:
-                summaries = [job.write(number, tell) for number in range(len(placed))]
+                summaries = job.finish(tell)
     return summaries[0]
 
 
@@ -124,6 +127,8 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
         As `track` does.
     """
     check_options(run)
+    if run.frame_log is not None:
+        check_frame_log(run.frame_log, run.input_files)
     cameras = load_cameras(run)
     objects = load_objects(run, cameras[0].camera)
     check_inputs(run, objects)
@@ -213,6 +218,7 @@ class _Job:
         sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
         self._times = LiveTimes()
+        self._interrupts = WaitingInterrupts(only_first=True)
         self._seen: dict[str, list[tuple[int, Keyframe]]] = {part.name: [] for part in placed}
         self._checks = {
             part.name: CameraCheck(part.camera, deforms=bool(part.model.parameters))
@@ -227,23 +233,29 @@ class _Job:
             sinks += [self._times, *screens]
         if self._checks:
             sinks.append(self._keep_for_camera)
+        streams: list[Sink] = []
         if run.in_two_passes:
             # What is sent is final: the second pass.
             sinks.append(self._keep_seen)
             # By its own points in each frame, which shows more of them as long as the one pose is not known well.
             placed = [with_pose(part, "free") if part.options.pose == "still" else part for part in placed]
         else:
-            sinks += self._begun_streams(placed)
+            streams = self._begun_streams(placed)
         views = {part.name: view for part, view in zip(placed, self._views, strict=True)}
         picture = LivePicture(placed[0].camera, views) if screens else None
-        self._session = new_session(placed, source, sinks, picture=picture, reregistration=self._again)
+        self._session = new_session(
+            placed, source, self._between_interrupts(sinks, streams), picture=picture, reregistration=self._again
+        )
 
     def run(self) -> None:
         """Track, and once more from a refined reference if that is asked for."""
         run = self._run
         if run.live:
             print(f"tracking {self._source.name} (Ctrl-C ends it)", file=sys.stderr)
-        self._session.run(run.seconds, progress=not run.live)
+            self._session.run(run.seconds)
+        else:
+            with self._interrupts:
+                self._session.run(progress=True)
         if run.in_two_passes:
             begun = self._placed
             self._track_refined(begun, {})
@@ -271,26 +283,53 @@ class _Job:
         """
         run = self._run
         print("refining what is one over the sequence ...", file=sys.stderr)
-        self._placed = []
+        placed = []
         for part in begun:
             end = opened[part.name].first if part.name in opened else np.inf
             seen = [keyframe for frame, keyframe in self._seen[part.name] if frame < end]
-            self._placed.append(_refined(part, seen, run))
-        for folder, part in zip(self._folders, self._placed, strict=True):
-            folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
-        self._views = [_view_of(part, run) for part in self._placed]
-        sinks: list[Sink] = [*self._folders]
-        if self._log is not None:
-            self._log.start_again()
-            sinks.append(self._log)
-        sinks += self._begun_streams(self._placed)
-        new_session(self._placed, self._source, sinks, reregistration=opened).run(progress=True)
+            placed.append(_refined(part, seen, run))
+        with self._interrupts:  # until then the frames of the pass before are the results
+            self._placed, self._views = placed, [_view_of(part, run) for part in placed]
+            for folder, part in zip(self._folders, placed, strict=True):
+                folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
+            sinks: list[Sink] = [*self._folders]
+            if self._log is not None:
+                self._log.start_again()
+                sinks.append(self._log)
+            whole = self._between_interrupts(sinks, self._begun_streams(placed))
+            new_session(placed, self._source, whole, reregistration=opened).run(progress=True)
 
-    def write(self, number: int, tell: Tell) -> dict[str, Any]:
-        """Write the run folder of one object, the video last because it takes longest; returns the summary."""
+    def _between_interrupts(self, sinks: Sequence[Sink], streams: Sequence[Sink]) -> list[Sink]:
+        """Sinks that all get a frame or none, then streams, which may wait for others; then interrupts are raised."""
+
+        def hand_out(tracked: TrackedFrame) -> None:
+            with WaitingInterrupts():
+                for sink in sinks:
+                    sink(tracked)
+
+        return [hand_out, *streams, lambda tracked: self._interrupts.raise_waiting()]
+
+    def finish(self, tell: Tell) -> list[dict[str, Any]]:
+        """Write the run folder of each object, then the videos, because they take longest; returns the summaries."""
+        summaries: list[dict[str, Any]] = []
+        try:
+            with WaitingInterrupts("writing what was tracked ..."):
+                for number in range(len(self._placed)):
+                    summaries.append(self._write(number))
+            if self._run.video and not self._run.live:
+                for number, summary in enumerate(summaries):
+                    if summary:
+                        self._draw(number)
+        finally:
+            with WaitingInterrupts():
+                for folder, summary in zip(self._folders, summaries, strict=False):  # an error may have ended it
+                    tell(folder.path, summary)
+        return summaries
+
+    def _write(self, number: int) -> dict[str, Any]:
+        """Write the run folder of one object but for its video; returns the summary, empty without a frame."""
         run, folder, part = self._run, self._folders[number], self._placed[number]
         if not len(folder.results):
-            tell(folder.path, {})
             return {}
         facts = _facts(run, run.objects[number], part, folder.results)
         notices = [*part.registration.warnings, *self._again[part.name].notices]
@@ -309,12 +348,13 @@ class _Job:
         if run.live:
             facts["live"] = self._times.figures() | {"n_dropped": self._session.n_dropped}
             self._times.write(folder.path / "latency.csv")
-        summary = folder.write(facts, notices)
-        if run.video and not run.live:
-            first = self._source.sources[0] if isinstance(self._source, SynchronizedFrames) else self._source
-            write_video(folder.path / "augmented.mp4", first, part.camera, folder.results, self._views[number])
-        tell(folder.path, summary)
-        return summary
+        return folder.write(facts, notices)
+
+    def _draw(self, number: int) -> None:
+        """Draw the video of one object."""
+        folder, camera = self._folders[number], self._placed[number].camera
+        first = self._source.sources[0] if isinstance(self._source, SynchronizedFrames) else self._source
+        write_video(folder.path / "augmented.mp4", first, camera, folder.results, self._views[number])
 
     def _screens(self, stack: ExitStack) -> list[Sink]:
         """Where the pictures of a live run go."""
