@@ -115,6 +115,25 @@ def test_a_prop_of_a_study_has_a_reaction() -> None:
         bar_study(couplings=[{"on": "x_max", "held": ["turn"]}])
 
 
+def test_a_coupling_that_holds_every_motion_is_a_clamp() -> None:
+    """A bar carries a traction on its side as between two ends that are fixed."""
+    pressed = [{"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-1 kPa * press"]}]
+    shared = {"loads": pressed, "parameters": {"press": {"range": [0.0, 2.0]}}}
+    clamped = bar_study(**shared, couplings=[{"on": "x_max", "held": ["x", "y", "z", "rx", "ry", "rz"]}])
+    fixed = bar_study(
+        **shared, couplings=[], supports=[{"kind": "fixed", "on": "x_min"}, {"kind": "fixed", "on": "x_max"}]
+    )
+    found, expected = (
+        sweep.take_snapshot(sweep.advance(sweep.first_state(), np.array([2.0])))
+        for sweep in (clamped.sweep_problem(), fixed.sweep_problem())
+    )
+    for name, values in expected.fields.items():
+        np.testing.assert_allclose(found.fields[name], values, atol=1e-9 * np.abs(values).max())
+    for name in ("force_x_max", "moment_x_max", "force_x_min"):
+        np.testing.assert_allclose(found.outputs[name], expected.outputs[name], atol=1e-9)
+    assert found.outputs["negative_pivots"] == 0
+
+
 def test_methods_that_project_equations_are_refused() -> None:
     several = {"bend": {"range": ["-2 N.mm", "2 N.mm"]}, "young": {"range": ["2 MPa", "3 MPa"]}}
     rubber = {"rubber": {"law": "neo_hookean", "young": "young", "poisson": 0.3}}

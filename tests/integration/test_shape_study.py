@@ -136,7 +136,7 @@ def test_mistakes_in_a_shape_are_named() -> None:
     with pytest.raises(StudyError, match=r"no surface 'rim'"):
         tube_study("20 mm", "30 mm", [THICKNESS | {"kept": "rim"}]).problem()
     with pytest.raises(StudyError, match=r"the axis of the radius has no direction"):
-        tube_study("20 mm", "30 mm", [RADIUS | {"axis": [0, 0, 0]}]).problem()
+        tube_study("20 mm", "30 mm", [RADIUS | {"axis": [0, 0, 0]}])
     with pytest.raises(StudyError, match=r"shape 1: 'growht' names 'growht', which is no parameter"):
         tube_study("20 mm", "30 mm", [THICKNESS | {"amplitude": "growht"}])
     with pytest.raises(StudyError, match=r"shape 1: unknown key width; known here: amplitude, kind"):

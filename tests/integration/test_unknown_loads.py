@@ -319,6 +319,23 @@ def test_the_certificate_says_how_well_responses_are_known(file):
     assert [text for text in build_warnings(certificate) if "off by 30 %" in text]
 
 
+@pytest.mark.parametrize(
+    ("section", "count"),
+    [
+        # Of the 9 nodes of the side 3 are held: 6 can move, each in three directions.
+        ({"on": "x_max", "direction": "any", "modes": 300}, 18),
+        # Places on the held bottom move nothing.
+        ({"on": ["x_max", "z_min"], "direction": "any", "modes": 300}, 18),
+        ({"on": "x_max", "modes": 300}, 9),
+    ],
+)
+def test_a_small_surface_has_as_many_loads_as_can_move_it(section, count):
+    small = {"generator": "block", "size": ["20 mm"] * 3, "divisions": [2, 2, 2], "cells": "hex8"}
+    model = build(make_study(STUDY | {"mesh": small, "unknown_loads": section}))
+    assert model.unknown_loads.count == model.certificate["unknown_loads"]["loads"] == count
+    assert all(np.isfinite(field.modes).all() for field in model.unknown_loads.responses.values())
+
+
 def test_mistakes_are_one_message(file, tmp_path, capsys):
     with pytest.raises(StudyError, match=r"no surface 'lid'; it has: .*z_max"):
         build(make_study(STUDY | {"unknown_loads": {"on": "lid"}}), tmp_path / "x.morph")

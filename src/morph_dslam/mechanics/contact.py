@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 
 Array = NDArray[np.float64]
@@ -98,7 +99,7 @@ class RigidSphere:
     ----------
     on : surface.
     centre : m: numbers or expressions of parameters.
-    radius : m: a number or an expression.
+    radius : m, positive: a number or an expression.
     inside : whether the solid is inside of the sphere.
     """
 
@@ -107,6 +108,9 @@ class RigidSphere:
     radius: Scalar
     inside: bool = False
     name, tolerance = "sphere", 0.0
+
+    def __post_init__(self) -> None:
+        _check_radius(self.radius)
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
@@ -127,7 +131,7 @@ class RigidCylinder:
     on : surface.
     point : of the axis, m: numbers or expressions of parameters.
     axis : (3,) direction; its length does not matter.
-    radius : m: a number or an expression.
+    radius : m, positive: a number or an expression.
     inside : whether the solid is inside of the cylinder.
     """
 
@@ -140,6 +144,7 @@ class RigidCylinder:
 
     def __post_init__(self) -> None:
         _check_direction(self.on, "axis", self.axis)
+        _check_radius(self.radius)
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
@@ -177,6 +182,12 @@ Contact = RigidObstacle | SurfaceContact
 def _check_direction(on: str, name: str, direction: tuple[float, float, float]) -> None:
     if not np.linalg.norm(direction) > 0.0:
         raise StudyError(f"the {name} of the contact on '{on}' has no direction: {direction}")
+
+
+def _check_radius(radius: Scalar) -> None:
+    """Refuse a radius that is not positive at the parameters' present values (StudyError)."""
+    if not (value := evaluate(radius)) > 0.0:
+        raise StudyError(f"radius = {1e3 * value:.4g} mm must be positive")
 
 
 def _unit(direction: tuple[float, float, float]) -> Array:

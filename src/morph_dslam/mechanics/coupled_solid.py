@@ -237,6 +237,8 @@ class _CoupledLinearisation:
     @cached_property
     def _condensed(self) -> tuple[Array, Array]:
         """K_ff^-1 K_fs G (p, n) and C (p, p) of the p motions that are free."""
+        if not len(self._moving):  # all sets are clamped, and the solver takes no empty block of right-hand sides
+            return np.zeros((0, self._n)), np.zeros((0, 0))
         unit = np.eye(len(self._coupled.columns))[self._moving]
         lifted = self._lifted(unit)
         followed = self._inner.solve(self._inner.apply(lifted))

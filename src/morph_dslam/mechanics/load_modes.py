@@ -25,6 +25,10 @@ Array = NDArray[np.float64]
 sla: Any = scipy.sparse.linalg
 #: Width of a pressure over the distance between their places.
 WIDTH = 0.4
+#: Supports hold a surface against a traction if the dofs that are free are across it, to this part.
+HELD_ACROSS = 1e-6
+#: Softness, as a part of the largest, below which a traction moves nothing: it acts where supports hold.
+SOFTLESS = 1e-10
 #: Steps that spread the places evenly (Lloyd).
 LLOYD = 50
 #: Loads (k, n_dofs) at the dofs to the change (k, n_dofs) of the solution that they cause.
@@ -116,6 +120,10 @@ class LoadedSurface:
         about = np.stack([y[:, 2] - z[:, 1], z[:, 0] - x[:, 2], x[:, 1] - y[:, 0]], axis=1)
         return np.hstack([weighted @ one, about])
 
+    def can_move(self, free: NDArray[np.bool_]) -> bool:
+        """Whether a traction can move the surface, of whose dofs (n_dofs,) those that are not ``free`` are held."""
+        return bool((np.abs(self.directions) > HELD_ACROSS)[:, free[self._places]].any())
+
     @property
     def on_surface(self) -> NDArray[np.int64]:
         """The mesh's nodes that are on the surface."""
@@ -143,7 +151,10 @@ def _mass(scalar: ngs.FESpace, region: ngs.Region, weight: Any) -> Any:
 
 
 def softest_tractions(surface: LoadedSurface, respond: Respond, count: int) -> tuple[Array, Array]:
-    """The ``count`` softest tractions (c, a, k) of unit mean square over 1 m2, and their softness (c,), m/Pa."""
+    """The ``count`` softest tractions (c, a, k) of unit mean square over 1 m2, and their softness (c,), m/Pa.
+
+    Fewer where the surface has not so many that move it.
+    """
     shape = surface.directions.shape[0], len(surface.dofs)
     size = int(np.prod(shape))
     turned = [sp.diags(direction) for direction in surface.directions.reshape(-1, shape[1])]
@@ -158,6 +169,7 @@ def softest_tractions(surface: LoadedSurface, respond: Respond, count: int) -> t
     start = np.random.default_rng(0).standard_normal(size)
     softness, vectors = sla.eigsh(operators[0], min(count, size - 1), mass, Minv=operators[1], v0=start)
     order = np.argsort(softness)[::-1]
+    order = order[softness[order] > SOFTLESS * softness.max()]
     return vectors.T[order].reshape(-1, *shape), softness[order]
 
 

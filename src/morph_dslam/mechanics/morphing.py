@@ -32,7 +32,7 @@ def radius_field(nodes: Array, point: Array, direction: Array) -> Array:
     """
     length = np.linalg.norm(direction)
     if not length > 0.0:
-        raise StudyError(f"the axis of the radius has no direction: {tuple(direction)}")
+        raise StudyError(f"the axis of the radius has no direction: {tuple(float(x) for x in direction)}")
     unit, arms = np.asarray(direction) / length, nodes - np.asarray(point)
     radial = arms - np.outer(arms @ unit, unit)
     radii = np.linalg.norm(radial, axis=1, keepdims=True)

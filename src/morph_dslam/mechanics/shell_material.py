@@ -51,7 +51,7 @@ class ShellMaterial:
         values = {name: evaluate(getattr(self, name)) for name in (*names, "poisson")}
         for name in names:
             if not values[name] > 0.0:
-                raise StudyError(f"{name} = {values[name]:g} Pa must be positive")
+                raise StudyError(f"{name} = {1e-6 * values[name]:.4g} MPa must be positive")
         if values["poisson"] ** 2 * values["young_cross"] >= values["young_fibre"]:
             raise StudyError(
                 f"poisson = {values['poisson']:g} is unstable for these moduli: "
@@ -84,7 +84,16 @@ class ShellMaterial:
 
 
 def isotropic(young: Scalar, poisson: Scalar, **others: Any) -> ShellMaterial:
-    """An isotropic material of a shell; ``others`` as `ShellMaterial`."""
+    """An isotropic material of a shell; ``others`` as `ShellMaterial`.
+
+    Raises StudyError if ``young`` is not positive or ``poisson`` is not above -1 and at most 0.5, at the parameters'
+    present values.
+    """
+    if not (value := evaluate(young)) > 0.0:
+        raise StudyError(f"young = {1e-6 * value:.4g} MPa must be positive")
+    # 0.5 is no limit of plane stress, where the thickness gives way, but no stable isotropic solid is beyond it.
+    if not -1.0 < (value := evaluate(poisson)) <= 0.5:
+        raise StudyError(f"poisson = {value:.4g} must be above -1 and at most 0.5")
     return ShellMaterial(young, young, poisson, young / (2.0 * (1.0 + poisson)), **others)
 
 

@@ -25,7 +25,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.shell_energy import AveragedNormals, ShellKinematics, ShellUnknowns, rim_angle
 from morph_dslam.mechanics.shell_material import ShellMaterial, components
 from morph_dslam.mechanics.shell_recovery import ShellRecovery
-from morph_dslam.mechanics.shell_supports import HoldsDirection
+from morph_dslam.mechanics.shell_supports import HoldsDirection, SymmetryPlane
 from morph_dslam.mechanics.solid import SolidProblem, Support
 from morph_dslam.mechanics.solid_assembly import Assembly, Term
 from morph_dslam.mechanics.solvers.linear_solver import TangentSolver
@@ -57,7 +57,8 @@ class ShellOptions:
 class ShellProblem(SolidProblem):
     """A shell with its material, supports, loads and parameters.
 
-    Raises StudyError for unknown sets, an unstable material, a thickness that is not positive, missing supports.
+    Raises StudyError for unknown sets, an unstable material, a thickness that is not positive, missing supports, and a
+    plane of symmetry whose set is in none.
 
     Parameters
     ----------
@@ -90,6 +91,8 @@ class ShellProblem(SolidProblem):
         material.check()
         if not evaluate(thickness) > 0.0:
             raise StudyError(f"the shell has thickness {evaluate(thickness):g} m; it must be positive")
+        for plane in (support for support in supports if isinstance(support, SymmetryPlane)):
+            plane.check(mesh)
         self.geometry = SurfaceMesh(mesh, [load.on for load in loads if isinstance(load, EdgeLoad)])
         self.mesh = self.geometry.mesh
         self.displacements = DisplacementSpace(self.geometry, self.options.order)

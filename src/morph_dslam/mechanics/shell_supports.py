@@ -9,10 +9,14 @@ import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.supports import AffineMotion, RigidRotation, cross_matrix
+from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
+#: A set lies in a plane if it extends across it by this part of its size at most: files round coordinates.
+IN_PLANE = 0.01
 
 
 @runtime_checkable
@@ -59,6 +63,17 @@ class SymmetryPlane:
     on: str
     axis: int
     centred_on = None
+
+    def check(self, mesh: Mesh) -> None:
+        """Refuse a set that does not lie in one plane across the axis (StudyError)."""
+        points = mesh.nodes[mesh.set_nodes(self.on)]
+        extents = np.ptp(points, axis=0)
+        if extents[self.axis] > IN_PLANE * extents.max():
+            axis = "xyz"[self.axis]
+            raise StudyError(
+                f"the set '{self.on}' is in no plane across {axis}: it extends {1e3 * extents[self.axis]:.4g} mm along "
+                f"{axis}; name the axis that its plane is across, or another set"
+            )
 
     @property
     def components(self) -> tuple[bool, bool, bool]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.kinematics import Kinematics, Shape
+from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.morphing import surface_normals
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.spaces import DisplacementSpace
@@ -324,13 +325,18 @@ class ElasticFoundation:
     Attributes
     ----------
     on : surface.
-    stiffness : k, Pa/m, on the undeformed area: a number or an expression of parameters.
+    stiffness : k, Pa/m, on the undeformed area, not negative: a number or an expression of parameters.
     normal_only : resist the displacement along the undeformed normal alone.
     """
 
     on: str
     stiffness: Scalar
     normal_only: bool = False
+
+    def __post_init__(self) -> None:
+        # Springs that push away from where they are at rest would make every state unstable.
+        if not (value := evaluate(self.stiffness)) >= 0.0:
+            raise StudyError(f"stiffness = {1e-9 * value:.4g} MPa/mm must not be negative")
 
     def energy(self, kinematics: Kinematics) -> Any:
         """Energy per area of NGSolve's mesh."""

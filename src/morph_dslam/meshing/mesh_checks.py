@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +86,35 @@ def described_extent(extent: NDArray[np.float64]) -> str:
     return " x ".join(f"{length:.3g}" for length in extent)
 
 
-def _check_orientation(mesh: Mesh) -> None:
+@dataclass(frozen=True)
+class WrongCells:
+    """Cells of one type that are inverted, folded or flat.
+
+    Attributes
+    ----------
+    cell_type : of the cells.
+    bad : their indices in the mesh.
+    count : of all cells of the type.
+    mirrored : whether all of them are turned inside out.
+    flat : whether none has more than rounding's volume of the wrong sign.
+    where : the place of the first, for messages.
+    """
+
+    cell_type: str
+    bad: Indices
+    count: int
+    mirrored: bool
+    flat: bool
+    where: str
+
+    def __str__(self) -> str:
+        kind = "flat" if self.flat else "inverted or folded"
+        counted = f"{len(self.bad)} of {self.count} {self.cell_type} cells"
+        return f"{counted} are {kind}, the first cell {self.bad[0]} {self.where}"
+
+
+def wrong_cells(mesh: Mesh) -> WrongCells | None:
+    """The cells of the first block that has inverted, folded or flat ones; None if all are sound."""
     for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
         determinants = jacobian_determinants(mesh, block)
         # Rounding leaves a flat cell a volume of either sign; its size cubed is what to measure it by.
@@ -93,19 +122,24 @@ def _check_orientation(mesh: Mesh) -> None:
         size = np.ptp(corners, axis=1).max(axis=1) ** block.type.dimension
         worst = determinants.min(axis=1)
         bad = np.flatnonzero(worst <= 1e-12 * size)
-        if not len(bad):
-            continue
-        where = place(mesh, block.connectivity[bad[0]])
-        if len(bad) == len(worst) and (determinants < 0.0).all():
-            raise StudyError(
-                f"every {block.cell_type} cell is inverted: their nodes are listed in mirrored order; "
-                "list them as VTK or Abaqus does"
-            )
-        kind = "inverted or folded" if worst[bad].min() < -1e-12 * size[bad].max() else "flat"
+        if len(bad):
+            mirrored = len(bad) == len(worst) and bool((determinants < 0.0).all())
+            flat = not worst[bad].min() < -1e-12 * size[bad].max()
+            where = place(mesh, block.connectivity[bad[0]])
+            return WrongCells(block.cell_type, start + bad, len(worst), mirrored, flat, where)
+    return None
+
+
+def _check_orientation(mesh: Mesh) -> None:
+    found = wrong_cells(mesh)
+    if found is None:
+        return
+    if found.mirrored:
         raise StudyError(
-            f"{len(bad)} of {len(worst)} {block.cell_type} cells are {kind}, the first cell {start + bad[0]} "
-            f"{where}; mend the mesh there (a wall thicker than its bend's radius folds its cells)"
+            f"every {found.cell_type} cell is inverted: their nodes are listed in mirrored order; "
+            "list them as VTK or Abaqus does"
         )
+    raise StudyError(f"{found}; mend the mesh there (a wall thicker than its bend's radius folds its cells)")
 
 
 def _check_duplicates(mesh: Mesh) -> None:

@@ -309,8 +309,24 @@ class ReducedModel:
         return self.displacement.inside(self.vector(parameters))
 
     def positions(self, parameters: ParameterValues, outside: Outside = "bounded") -> Array:
-        """Deformed node positions (n, 3) in the object frame, metres."""
-        return self.nodes + self.displacement.value(self.vector(parameters), outside)
+        """Deformed node positions (n, 3) in the object frame, metres.
+
+        Parameters
+        ----------
+        parameters : SI, by name or in order.
+        outside : what holds outside of the ranges (`inside` says of which); "bounded", unless stated, takes each value
+            at the nearest end of its range.
+
+        Raises
+        ------
+        ParameterError
+            As `vector`, or if a value is not a number (NaN).
+        """
+        mu = self.vector(parameters)
+        if len(missing := np.flatnonzero(np.isnan(mu))):
+            name = self.parameters[missing[0]].name
+            raise ParameterError(f"the parameter '{name}' is not a number (NaN): give it a value")
+        return self.nodes + self.displacement.value(mu, outside)
 
     @property
     def fields(self) -> dict[str, SeparatedField]:

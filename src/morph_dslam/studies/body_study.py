@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.contact import RigidCylinder, RigidSphere
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.shell_material import ShellMaterial
+from morph_dslam.mechanics.supports import ElasticFoundation
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
@@ -68,22 +71,34 @@ def with_named_sets(mesh: Mesh, sets: Iterable[NamedSet]) -> Mesh:
     )
 
 
+#: What cannot be at every value of its constants: a thickness is a float.
+_CHECKED = (Material, ShellMaterial, RigidSphere, RigidCylinder, ElasticFoundation, float)
+#: Parameters of one quantity whose ends are all combined.
+_MOST_COMBINED = 8
+
+
 def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter]) -> None:
     """Read every value of sections with ``make``, so that a mistake is found before anything is solved.
 
-    Materials and thicknesses are checked at the defaults of the parameters, and at both ends of the range of each that
-    they depend on. Raises ValueError saying in which of the ``parts``, named sections, the mistake is.
+    Materials, thicknesses, radii of obstacles and foundations are checked at the defaults of the parameters, and at
+    both ends of the range of each that they depend on. Raises ValueError saying in which of the ``parts``, named
+    sections, the mistake is, and at which value of a parameter if that is its cause.
     """
+    defaults = np.array([p.default for p in parameters])
     for where, section in parts:
-        defaults = np.array([p.default for p in parameters])
         used: set[int] = set()
         try:
-            if isinstance(_made(section, parameters, defaults, used), (Material, ShellMaterial, float)):
-                for k in sorted(used):
-                    for end in (parameters[k].lower, parameters[k].upper):
-                        _check_at_end(section, parameters, k, end)
+            made = _made(section, parameters, defaults, used)
         except StudyError as error:
-            raise ValueError(f"{where}: {error}") from error
+            blamed = _to_blame(section, parameters, used)
+            raise ValueError(f"{where}: {error}{_changed_range(parameters, blamed, defaults)}") from error
+        if not isinstance(made, _CHECKED):
+            continue
+        for at, mu in range_ends(parameters, sorted(used), combined=not isinstance(made, (Material, ShellMaterial))):
+            try:
+                _made(section, parameters, mu, set())
+            except StudyError as error:
+                raise ValueError(f"{where}: {error}{_changed_range(parameters, at, mu)}") from error
 
 
 def _made(section: Any, parameters: Sequence[Parameter], mu: Array, used: set[int]) -> Any:
@@ -100,14 +115,45 @@ def _made(section: Any, parameters: Sequence[Parameter], mu: Array, used: set[in
     return made
 
 
-def _check_at_end(section: Any, parameters: Sequence[Parameter], k: int, end: float) -> None:
-    """Raise StudyError, which names the state, if a section cannot be with parameter ``k`` at an end of its range."""
+def range_ends(parameters: Sequence[Parameter], used: list[int], combined: bool) -> Iterator[tuple[list[int], Array]]:
+    """Both ends of the range of each parameter ``used``, the others at their defaults, then all ends ``combined``."""
+    groups = [[k] for k in used]
+    if combined and 1 < len(used) <= _MOST_COMBINED:
+        groups.append(used)
+    for group in groups:
+        for values in product(*((parameters[k].lower, parameters[k].upper) for k in group)):
+            mu = np.array([p.default for p in parameters])
+            mu[group] = values
+            yield group, mu
+
+
+def _to_blame(section: Any, parameters: Sequence[Parameter], used: set[int]) -> list[int]:
+    """Those parameters ``used`` whose default alone makes a section impossible: with another value it can be."""
+    return [k for k in sorted(used) if any(_can_be(section, parameters, k, value) for value in _others(parameters[k]))]
+
+
+def _others(parameter: Parameter) -> tuple[float, ...]:
+    """Values that a parameter might have in place of its default; mirrored ones for ranges of a wrong sign."""
+    lower, upper = parameter.lower, parameter.upper
+    return upper, lower, (lower + upper) / 2.0, -lower, -upper
+
+
+def _can_be(section: Any, parameters: Sequence[Parameter], k: int, value: float) -> bool:
     mu = np.array([p.default for p in parameters])
-    mu[k] = end
+    mu[k] = value
     try:
         _made(section, parameters, mu, set())
-    except StudyError as error:
-        raise StudyError(f"{error} where {state_text(parameters[k : k + 1], mu[k])}: change its range") from error
+    except StudyError:
+        return False
+    return True
+
+
+def _changed_range(parameters: Sequence[Parameter], at: list[int], mu: Array) -> str:
+    """What ends the message about a section that cannot be at ``mu`` (d,), because of the parameters ``at``."""
+    if not at:
+        return ""
+    state = state_text([parameters[k] for k in at], mu[at])
+    return f" where {state}: change {'its range' if len(at) == 1 else 'their ranges'}"
 
 
 def reader_of(symbols: ParameterSymbols) -> Reader:
@@ -129,6 +175,10 @@ class BodyStudy:
 
     def _parts(self) -> list[tuple[str, Any]]:
         """All sections whose values may name parameters, with what messages call them."""
+        raise NotImplementedError
+
+    def doubts(self) -> list[str]:
+        """Sentences on what the study asks for that is probably not meant, or not served by its elements."""
         raise NotImplementedError
 
     def check_parameters_used(self, elsewhere: Sequence[str] = ()) -> None:

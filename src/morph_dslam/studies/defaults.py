@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 from morph_dslam.errors import StudyError
+from morph_dslam.model.functions import total_degree_indices
 from morph_dslam.reduction.registry import ReductionMethod, reduction_method, reduction_methods
+from morph_dslam.reduction.regression import FOLDS
+from morph_dslam.studies.body_study import BodyStudy
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_study import ShellStudy
+from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.study import Study
 
 #: Solves that greedy sampling starts with, beside one for each parameter.
@@ -33,8 +39,32 @@ def resolve_defaults(study: Study) -> Study:
     if not isinstance(study, ExternalStudy):
         dimension = len(study.model_parameters())
         _check_functions(study.reduction, method, dimension)
-        update["sampling"] = _sampling(study.sampling, method, dimension, _why_no_equations(study) is None)
+        sampling = _sampling(study.sampling, method, dimension, _why_no_equations(study) is None)
+        if isinstance(study, BodyStudy) and method.name == "pod" and sampling.scheme == "sobol":
+            _check_count(sampling.training, dimension, _has_slopes(study))
+        update["sampling"] = sampling
     return study.model_copy(update=update)
+
+
+def _has_slopes(study: BodyStudy) -> bool:
+    """Whether all fields that are reduced have derivatives by the parameters.
+
+    Those of viscoelastic solids are unknown, and those of what holds a shell.
+    """
+    if isinstance(study, SolidStudy):
+        return study.time is None
+    return isinstance(study, ShellStudy) and all(support.kind == "foundation" for support in study.supports)
+
+
+def _check_count(training: int, dimension: int, slopes: bool) -> None:
+    """Refuse fewer samples than a polynomial of second degree is fitted to, which shows when all are solved only."""
+    rows, terms = 1 + dimension if slopes else 1, len(total_degree_indices(dimension, 2))
+    # What `regression.fit_functions` asks for with one of the parts left out.
+    fewest = next(n for n in count(1) if terms <= 0.8 * rows * (n - -(-n // FOLDS)))
+    if training < fewest:
+        raise StudyError(
+            f"sampling.training: {training} samples are too few for {dimension} parameters: give {fewest} at least"
+        )
 
 
 def _why_no_equations(study: Study) -> str | None:

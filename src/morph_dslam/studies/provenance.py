@@ -15,6 +15,7 @@ from morph_dslam.mechanics.solvers.linear_solver import default_engine
 from morph_dslam.mechanics.spaces import default_order, has_mixed_form
 from morph_dslam.model import ReducedModel
 from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.body_study import BodyStudy
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.solid_study import SolidStudy
@@ -60,7 +61,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-def locking_warnings(study: Study) -> list[str]:
+def study_warnings(study: Study) -> list[str]:
+    """Sentences on what a study asks for that its elements do not serve, or that is probably not meant."""
+    return [*_locking(study), *study.doubts()] if isinstance(study, BodyStudy) else []
+
+
+#: The same, by the name that callers had when it was about elements that lock alone.
+locking_warnings = study_warnings
+
+
+def _locking(study: BodyStudy) -> list[str]:
     """A sentence for each material that is nearly incompressible in displacement elements.
 
     Constants that are parameters count with their defaults. Mixed elements and the default ones of hex8 cells do not

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, Literal
@@ -20,6 +21,8 @@ from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_surface_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.meshing.surface_checks import check_surface
+from morph_dslam.model import Parameter
+from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section, SetName
 from morph_dslam.studies.solid_sections import (
     BodyForceLoad,
@@ -47,6 +50,8 @@ from morph_dslam.studies.solid_sections import (
 Array = NDArray[np.float64]
 CellName = Literal["tri3", "tri6", "quad4", "quad8", "quad9"]
 Divisions = Annotated[tuple[Count, Count], AfterValidator(few_cells)]
+#: The largest thickness as a part of the size.
+THICKEST = 0.05
 FULL_TURN = (0.0, surface_generators.FULL_TURN)
 
 
@@ -156,9 +161,18 @@ class SetSection(Section):
         return self
 
     def nodes(self, points: Array) -> NDArray[np.int64]:
-        """Indices of the nodes, of all (n, 3) in metres."""
+        """Indices of the nodes, of all (n, 3) in metres.
+
+        StudyError if ``nearest`` is farther away from them than the mesh is long, as a point in a wrong unit is.
+        """
         if self.nearest is not None:
-            return np.array([np.argmin(np.linalg.norm(points - self.nearest, axis=1))])
+            distances, longest = np.linalg.norm(points - self.nearest, axis=1), np.ptp(points, axis=0).max()
+            if distances.min() > longest:
+                raise StudyError(
+                    f"nearest is {1e3 * distances.min():.4g} mm away from the mesh, which is {1e3 * longest:.4g} mm "
+                    "long: give a point near it"
+                )
+            return np.array([np.argmin(distances)])
         low, high = np.sort(np.array(self.box), axis=0)
         tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
         return np.flatnonzero(((points >= low - tolerance) & (points <= high + tolerance)).all(axis=1))
@@ -170,10 +184,14 @@ def shell_mesh(section: Any, sets: dict[str, SetSection]) -> Mesh:
     It is made once, and again when its file has been written again.
     """
     mesh = _made(section, file_stamp(section.file) if isinstance(section, _FileSurface) else None)
-    found = {name: chosen.nodes(mesh.nodes) for name, chosen in sets.items()}
-    for name, nodes in found.items():
+    found = {}
+    for name, chosen in sets.items():
         if name in mesh.node_sets:
             raise StudyError(f"sets.{name}: the mesh has a set of this name; choose another")
+        try:
+            nodes = found[name] = chosen.nodes(mesh.nodes)
+        except StudyError as error:
+            raise StudyError(f"sets.{name}: {error}") from error
         if not len(nodes):
             raise StudyError(f"sets.{name}: no node of the mesh lies in the box; move or widen it")
     return replace(mesh, node_sets={**mesh.node_sets, **found})
@@ -201,8 +219,21 @@ class ShellSection(Section):
         """The thickness, m."""
         thickness = read(self.thickness, "length")
         if not evaluate(thickness) > 0.0:
-            raise StudyError(f"thickness = {evaluate(thickness):g} m must be positive")
+            raise StudyError(f"thickness = {1e3 * evaluate(thickness):.4g} mm must be positive")
         return thickness
+
+
+def thickness_warnings(section: ShellSection, mesh: Mesh, parameters: Sequence[Parameter]) -> list[str]:
+    """A sentence if the thickness, at its largest over the parameters, is not small beside the mesh."""
+    thickness = read_affine(section.thickness, "length", parameters)
+    ends = [max(slope * p.lower, slope * p.upper) for slope, p in zip(thickness.slopes, parameters, strict=True)]
+    largest, size = thickness.constant + sum(ends), float(np.ptp(mesh.nodes, axis=0).max())
+    if largest <= THICKEST * size:
+        return []
+    return [
+        f"the shell is {1e3 * largest:.4g} mm thick and {1e3 * size:.4g} mm long: above a twentieth of the size it "
+        "bends by transverse shear too, which is left out; solve it as a solid"
+    ]
 
 
 class ShellMaterialSection(Section):
@@ -271,6 +302,16 @@ class _SymmetrySupport(Section):
         return SymmetryPlane(self.on, "xyz".index(self.axis))
 
 
+def check_symmetry(sections: Sequence[Any], mesh: Mesh) -> None:
+    """Refuse planes of symmetry, among the supports of a study, whose set is in none (StudyError)."""
+    for number, section in enumerate(sections, start=1):
+        if isinstance(section, _SymmetrySupport):
+            try:
+                SymmetryPlane(section.on, "xyz".index(section.axis)).check(mesh)
+            except StudyError as error:
+                raise StudyError(f"support {number}: {error}") from error
+
+
 class _ShellRotationSupport(RotationSupport):
     """Turns a set as a rigid body about an axis, then shifts it; its edges are clamped in the body.
 
@@ -334,7 +375,7 @@ class _ShellForceLoad(ForceLoad):
 class _ShellPatchLoad(MovingPatchLoad):
     """A force spread over a round patch of a cell set, whose ``centre`` may move with a parameter.
 
-    ``width`` is the standard deviation of its Gaussian density, at least about half an element.
+    ``width`` is the standard deviation of its Gaussian density, at least half a cell.
     """
 
     on: SetName = "all"

@@ -21,6 +21,7 @@ from morph_dslam.studies.body_study import (
     reader_of,
     with_named_sets,
 )
+from morph_dslam.studies.moving_loads import check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
@@ -31,11 +32,14 @@ from morph_dslam.studies.shell_sections import (
     ShellSection,
     ShellSupportSection,
     SurfaceSection,
+    check_symmetry,
     shell_mesh,
+    thickness_warnings,
 )
 from morph_dslam.studies.shell_sweep import ShellSweep
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import mesh_fingerprint
+from morph_dslam.studies.solid_sweep import loadable
 
 #: Kinds of supports and loads that name a cell set; others name nodes.
 _ON_CELLS = ("foundation", "traction", "force", "pressure", "body_force", "moving_patch", "moving_line")
@@ -97,6 +101,8 @@ class ShellStudy(BodyStudy, Section):
         for where, section in self._listed():
             if section.kind != "gravity":
                 yield f"{where}: on", section.on, "cells" if section.kind in _ON_CELLS else "nodes"
+        if self.unknown_loads and self.unknown_loads.on:
+            yield "unknown_loads.on", self.unknown_loads.on, "cells"
 
     def fingerprint(self) -> str:
         """Hash of mesh, shell, material, supports, loads, parameters' names, elements and solver version."""
@@ -109,10 +115,12 @@ class ShellStudy(BodyStudy, Section):
 
     def problem(self, options: ShellOptions | None = None) -> ShellProblem:
         """The discretised shell, with the study's own elements if ``options`` name no others."""
-        symbols = ParameterSymbols(self.model_parameters())
+        symbols, mesh = ParameterSymbols(self.model_parameters()), self.shell_mesh()
+        check_widths(self.loads, mesh)
+        check_symmetry(self.supports, mesh)
         read = reader_of(symbols)
         return ShellProblem(
-            self.shell_mesh(),
+            mesh,
             self.material.make(read),
             self.shell.make(read),
             [section.make(read) for section in self.supports],
@@ -123,7 +131,13 @@ class ShellStudy(BodyStudy, Section):
 
     def sweep_problem(self) -> SweepProblem:
         """What the sweep solves with."""
-        return ShellSweep(self.problem())
+        return loadable(ShellSweep(self.problem()), self.unknown_loads)
+
+    def doubts(self) -> list[str]:
+        """See `BodyStudy`: a thickness that is none of a shell, loads that fall beside it."""
+        mesh, parameters = self.shell_mesh(), self.model_parameters()
+        thick = thickness_warnings(self.shell, mesh, parameters)
+        return thick + landing_warnings(self.loads, mesh, parameters)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its cells cut into triangles, and the area of each node."""

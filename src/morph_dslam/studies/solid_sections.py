@@ -370,7 +370,7 @@ class ForceLoad(_Applied):
 class MovingPatchLoad(_Applied):
     """A force spread over a round patch of a surface, whose ``centre`` may move with a parameter.
 
-    ``width`` is the standard deviation of its Gaussian density, at least about half an element.
+    ``width`` is the standard deviation of its Gaussian density, at least half a cell of the surface.
     """
 
     kind: Literal["moving_patch"]

@@ -32,10 +32,11 @@ from morph_dslam.studies.body_study import (
     with_named_sets,
 )
 from morph_dslam.studies.material_sections import MaterialSection
+from morph_dslam.studies.moving_loads import check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
-from morph_dslam.studies.shape_sections import ShapeSection, shape_fields
+from morph_dslam.studies.shape_sections import ShapeSection, read_shape, shape_fields, shape_fingerprints
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
     ContactSection,
@@ -47,10 +48,12 @@ from morph_dslam.studies.solid_sections import (
     make_mesh,
     mesh_fingerprint,
 )
-from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep
+from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep, loadable
 
 #: `SolidOptions.mixed` by the name of a formulation.
 MIXED = {"automatic": None, "displacement": False, "mixed": True}
+#: More increments of time than these in a solve are a mistake in the unit of a step.
+MOST_INCREMENTS = 100_000
 #: Kinds of supports, loads, contacts and shapes that name a surface, and those that name cells; others name nodes.
 _ON_SURFACES = (
     "foundation", "traction", "force", "pressure", "moving_patch", "moving_line", "thickness",
@@ -105,6 +108,8 @@ class SolidStudy(BodyStudy, Section):
         self._check_weight()
         if self.unknown_loads and self.couplings:
             raise ValueError("[unknown_loads] is for solids without [[couplings]]: leave out one of both")
+        if self.unknown_loads and self.time:
+            raise ValueError("[unknown_loads] is for elastic solids, not for viscoelastic ones: leave it out")
         return self
 
     def _check_weight(self) -> None:
@@ -133,9 +138,22 @@ class SolidStudy(BodyStudy, Section):
         if not viscous:
             raise ValueError("[time] is for viscoelastic materials, and none has a prony series")
         if clock.default != clock.lower:
-            raise ValueError(f"parameters.{clock.name}: time starts at the lower end; leave out the default")
+            raise ValueError(f"parameters.{clock.name}: {self._why_no_clock(clock.name)}")
+        # A solve follows time from the lower end of its range, whatever the sample.
+        increments = (clock.upper - clock.lower) / self.time.step
+        if increments > MOST_INCREMENTS:
+            raise ValueError(
+                f"time.step: {self.time.step:g} s makes {increments:.3g} increments over the range of {clock.name}, "
+                f"and {MOST_INCREMENTS} are the most: take a longer step, or a shorter range"
+            )
         if self.time.rest is not None:
             self._check_rest(parameters, parameters.index(clock))
+
+    def _why_no_clock(self, name: str) -> str:
+        """Why a parameter whose default is not the lower end of its range cannot be the time."""
+        if self.parameters[name].default is not None:
+            return "time starts at the lower end; leave out the default"
+        return "time starts at the lower end of its range, which cannot be below 0 s: begin it at 0 s or later"
 
     def _check_rest(self, parameters: tuple[Parameter, ...], clock: int) -> None:
         """What rests before the time begins must be there, and cannot depend on the time."""
@@ -207,10 +225,12 @@ class SolidStudy(BodyStudy, Section):
         mesh = self.solid_mesh()
         content["mesh"] = mesh_fingerprint(mesh)
         content["code"] = SOLVER_VERSION
-        content |= {"shape": [section.fingerprint(mesh) for section in self.shape]} if self.shape else {}
+        content |= {"shape": shape_fingerprints(self.shape, mesh)} if self.shape else {}
         content |= self.model_dump(mode="json", include={"couplings"}) if self.couplings else {}
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
         for section in content.get("contacts", ()):
+            if section["kind"] != "surface":
+                content["passages"] = "refused"  # earlier versions kept solutions with an obstacle behind a wall
             if section["kind"] == "mesh":
                 section["file"] = hashlib.sha256(Path(section["file"]).read_bytes()).hexdigest()
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -218,6 +238,7 @@ class SolidStudy(BodyStudy, Section):
     def problem(self, options: SolidOptions | None = None) -> SolidProblem:
         """The discretised solid, with the study's own elements if ``options`` name no others."""
         parameters, mesh = self.model_parameters(), self.solid_mesh()
+        check_widths(self.loads, mesh)
         symbols = ParameterSymbols(parameters)
         reader = reader_of(symbols)
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
@@ -258,9 +279,16 @@ class SolidStudy(BodyStudy, Section):
     def sweep_problem(self) -> SweepProblem:
         """What the sweep solves with."""
         if self.time is None:
-            return SolidSweep(self.problem())
+            return loadable(SolidSweep(self.problem()), self.unknown_loads)
         clock = list(self.parameters).index(self.time.parameter)
         return ViscousSweep(self.problem(), clock, self.time.step, self.time.rest or 0.0)
+
+    def doubts(self) -> list[str]:
+        """See `BodyStudy`: loads that fall beside their surface."""
+        mesh, parameters = self.solid_mesh(), self.model_parameters()
+        moves = any(load.kind in ("moving_patch", "moving_line") for load in self.loads)
+        shape = read_shape(self.shape, mesh, parameters) if moves else ()
+        return landing_warnings(self.loads, mesh, parameters, shape)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""

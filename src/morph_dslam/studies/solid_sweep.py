@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import SolverError
+from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.load_modes import LoadedSurface, Respond
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state
+from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state, refuse_passage
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
 from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.sections import UnknownLoadsSection
 
 Array = NDArray[np.float64]
 #: Each increment of time of a rest is so many times the one before.
@@ -129,7 +131,8 @@ def follow(problem: SolidProblem, start: State, target: Array) -> State:
         return advance(problem, start, target)[-1]
     except PathError as error:
         last = problem.state_text(error.states[-1].mu)
-        raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged") from error
+        further = f": {error.passage}, however small the increments" if error.passage else ""
+        raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged{further}") from error
 
 
 @dataclass(frozen=True)
@@ -190,6 +193,7 @@ class SolidSweep:
         try:
             state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
             state = state or solve(self.problem, target, State(target, predicted))
+            refuse_passage(self.problem, State(start.mu, start.dofs), state)
         except SolverError:
             state = follow(self.problem, State(start.mu, start.dofs), target)
         return self._with_slopes(state)
@@ -228,6 +232,23 @@ class SolidSweep:
         if state.negative_pivots is not None:
             snapshot.outputs["negative_pivots"] = np.array(state.negative_pivots)
         return snapshot
+
+
+Loadable = TypeVar("Loadable", bound=SolidSweep)
+
+
+def loadable(sweep: Loadable, section: UnknownLoadsSection | None) -> Loadable:
+    """The sweep itself; StudyError if unknown loads of the study could move nothing."""
+    if section is not None:
+        inward = section.direction == "inward"
+        if not sweep.loaded_surface(section.on, inward).can_move(sweep.problem.free):
+            where = f"'{section.on}'" if section.on else "the shell"
+            acting = "a pressure" if inward else "a force"
+            raise StudyError(
+                f"unknown_loads.on: supports hold all of {where}, so that {acting} there moves nothing: name another "
+                "surface"
+            )
+    return sweep
 
 
 @dataclass(frozen=True)

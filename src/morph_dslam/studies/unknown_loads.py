@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.load_modes import (
+    SOFTLESS,
     LoadedSurface,
     Respond,
     common_tractions,
@@ -82,8 +83,10 @@ def reduce_unknown_loads(
     else:
         found = [softest_tractions(surface, problem.response(state), section.modes) for state in states]
         tractions = common_tractions(surface, found, section.modes)
-    compliance, _ = surface.compliance(tractions, problem.response(states[0]))
-    tractions = tractions / np.sqrt(np.diag(compliance))[:, None, None]
+    energies = np.diag(surface.compliance(tractions, problem.response(states[0]))[0])
+    # Loads at places that supports hold move nothing, and have no size that they could be measured by.
+    moving = energies > SOFTLESS * energies.max()
+    tractions = tractions[moving] / np.sqrt(energies[moving])[:, None, None]
     responses: dict[str, list[NDArray]] = {}
     for file in tqdm(samples.files, desc="responses to loads", unit="state"):
         state = problem.unpack(load_state(file))

@@ -1,0 +1,86 @@
+"""What is checked of the moving loads of a study: their widths, and whether their force lands on the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.landed_force import share_of_line, share_of_patch, smallest_cell
+from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.model import Parameter
+from morph_dslam.model.reduced_model import state_text
+from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.body_study import numbered, range_ends
+from morph_dslam.studies.shape_sections import Shape, moved_nodes
+from morph_dslam.studies.solid_sections import MovingLineLoad, MovingPatchLoad
+
+Array = NDArray[np.float64]
+Moving = MovingPatchLoad | MovingLineLoad
+#: A width in cells below which quadrature misses a density between its points.
+NARROWEST = 0.5
+#: A part of the force that is worth a warning if it does not land.
+LANDED = 0.95
+#: A part that rounds to none of it.
+NONE = 0.005
+
+
+def check_widths(loads: Sequence[Any], mesh: Mesh) -> None:
+    """Refuse moving loads, among the ``loads`` of a study, that are too narrow for the cells (StudyError)."""
+    for where, load in _moving(loads):
+        size = smallest_cell(mesh, _faces(mesh, load.on))
+        if load.width < NARROWEST * size * (1.0 - 1e-6):
+            raise StudyError(
+                f"{where}: width = {1e3 * load.width:.4g} mm is less than half a cell of '{load.on}', the smallest of "
+                f"which measures {1e3 * size:.4g} mm, and the force would be lost between points of integration: make "
+                f"it {1e3 * NARROWEST * size:.4g} mm at least, or the cells smaller"
+            )
+
+
+def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter], shape: Shape = ()) -> list[str]:
+    """A sentence for each moving load a part of whose force falls beside its surface.
+
+    Looked at are the defaults of the parameters, and the ends of the ranges of those that move the load or the shape.
+    """
+    found = []
+    for where, load in _moving(loads):
+        centre = [read_affine(value, "length", parameters) for value in load.centre]
+        slopes = [value.slopes for value in (*centre, *(amplitude for amplitude, _ in shape))]
+        used = np.flatnonzero(np.any(slopes, axis=0)).tolist()
+        states = [np.array([p.default for p in parameters]), *(mu for _, mu in range_ends(parameters, used, True))]
+        faces = mesh.face_triangles(_faces(mesh, load.on))
+        shares = [_share(load, moved_nodes(mesh, shape, mu)[faces], np.array([c(mu) for c in centre])) for mu in states]
+        worst = int(np.argmin(shares))
+        if shares[worst] < LANDED:
+            state = state_text([parameters[k] for k in used], states[worst][used])
+            at = f" where {state}" if used else ""
+            landed = f"only {100.0 * shares[worst]:.0f} %" if shares[worst] > NONE else "nothing"
+            found.append(
+                f"{where}: {landed} of the force lands on '{load.on}'{at}, and the rest falls beside it: keep the "
+                "centre about two widths away from the rim"
+            )
+    return found
+
+
+def _moving(loads: Sequence[Any]) -> Iterator[tuple[str, Moving]]:
+    """The moving loads with what messages call them."""
+    for where, load in numbered("load", loads):
+        if isinstance(load, Moving):
+            yield where, load
+
+
+def _faces(mesh: Mesh, name: str) -> NDArray[np.int64]:
+    """Faces (f, 2) of a surface of a solid or of a cell set of a shell."""
+    if name in mesh.surfaces:
+        return mesh.surface(name)
+    cells = mesh.cells(name)
+    return np.column_stack([cells, np.zeros_like(cells)])
+
+
+def _share(load: Moving, triangles: Array, centre: Array) -> float:
+    if isinstance(load, MovingLineLoad):
+        return share_of_line(triangles, centre, np.array(load.direction), load.width)
+    return share_of_patch(triangles, centre, load.width)
