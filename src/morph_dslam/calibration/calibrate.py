@@ -136,7 +136,7 @@ class Calibration:
             )
         yield from camera_doubts(solution.camera)
         yield from _of_two_cameras(solution, self.board)
-        if solution.flatness is not None and solution.flatness > BENT * self.board.length:
+        if solution.flatness > BENT * self.board.length:
             yield f"the board is bent: its corners are up to {1e3 * solution.flatness:.1f} mm off its plane"
 
     def table(self) -> str:

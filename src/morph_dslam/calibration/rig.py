@@ -8,7 +8,7 @@ error of its principal point, and moves it along its axis by that of its focal l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -119,7 +119,7 @@ def calibrate_rig(
         found = find_views(of_camera, board, picture, step)
         best = best_views(found)
         cameras.append(Calibration(solve_intrinsics(best.views, board, best.size, lens_model), best, board, picture))
-        seen.append(_by_number(found.views))
+        seen.append(_by_number(_with_shape(found.views, cameras[0].solution.shape)))
     rig = _solve(cameras, seen)
     if output is not None:
         try:
@@ -136,6 +136,11 @@ def calibrate_rig(
 def _picture(output: Path, number: int) -> Path:
     picture = check_output(output)
     return picture.with_name(f"{output.stem}_cam{number}_calibration.png")
+
+
+def _with_shape(views: Sequence[View], shape: Array | None) -> Sequence[View]:
+    """Views of the whole board as the first camera solved for its corners, if it did."""
+    return views if shape is None else [replace(view, points=shape) for view in views]
 
 
 def _by_number(views: Sequence[View]) -> dict[int, View]:
@@ -235,7 +240,8 @@ def _first_poses(cameras: Sequence[Camera], sightings: Sequence[_Sighting]) -> t
 
 def _distances(camera: Camera, camera_from_board: RigidTransform, view: View) -> Array:
     """How far a view's corners (n,) are from where a pose has them, pixels."""
-    return np.linalg.norm(camera.project_recorded(camera_from_board.apply(view.points)) - view.corners, axis=1)
+    off = camera.project_recorded(camera_from_board.apply(view.points)) - view.corners
+    return np.asarray(np.linalg.norm(off, axis=1), dtype=np.float64)
 
 
 class _Adjustment:

@@ -50,8 +50,7 @@ class Solution:
     residuals : (v) arrays (n, 2) of found minus projected corners, pixels
     focal_deviation : standard deviation of fx and fy, pixels
     centre_deviation : of cx and cy, pixels
-    flatness : largest distance of a corner, as solved for, from the plane that fits the board best, metres; None where
-        the board is taken as flat
+    shape : (n, 3) the corners as solved for, metres; None where the board is taken as flat
     """
 
     camera: Camera
@@ -61,7 +60,7 @@ class Solution:
     residuals: tuple[Array, ...]
     focal_deviation: tuple[float, float]
     centre_deviation: tuple[float, float]
-    flatness: float | None = None
+    shape: Array | None = None
 
     @property
     def view_rms(self) -> Array:
@@ -72,6 +71,14 @@ class Solution:
     def rms(self) -> float:
         """Root mean square residual of all views, pixels."""
         return float(np.sqrt((self.view_rms**2).mean()))
+
+    @property
+    def flatness(self) -> float:
+        """Largest distance of a corner, as solved for, from the plane that fits the board best, metres."""
+        if self.shape is None:
+            return 0.0
+        centred = self.shape - self.shape.mean(axis=0)
+        return float(np.abs(centred @ np.linalg.svd(centred)[2][2]).max())
 
     @property
     def tilts(self) -> Array:
@@ -140,11 +147,9 @@ def _solve_radial_tangential(views: Sequence[View], size: tuple[int, int], held_
     if held_corner < 0:
         return _solution(camera, views, rotations, translations, of_camera)
     shape = np.asarray(points, dtype=float).reshape(-1, 3)
-    centred = shape - shape.mean(axis=0)
-    flatness = float(np.abs(centred @ np.linalg.svd(centred)[2][2]).max())
     shaped = [replace(view, points=shape) for view in views]
     solved = _solution(camera, shaped, rotations, translations, of_camera)
-    return replace(solved, views=tuple(views), flatness=flatness)
+    return replace(solved, views=tuple(views), shape=shape)
 
 
 def _solve_fisheye(views: Sequence[View], size: tuple[int, int]) -> Solution:
