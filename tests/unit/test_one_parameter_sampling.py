@@ -137,6 +137,85 @@ def test_sampling_ends_at_the_most_samples_and_leaves_what_cannot_be_solved(tmp_
     assert not np.any((samples > 0.0) & (samples < 0.125 * 6e5)), "nothing is looked for beside a failure"
 
 
+def step(t: float) -> tuple[float, float]:
+    """A gentle slope that jumps by one at 0.37."""
+    return 0.1 * t + (t > 0.37), 0.1
+
+
+@pytest.mark.parametrize(("sampling", "widest"), [({}, 1e-3), ({"training": 20}, 0.0625)])
+def test_a_jump_is_named_and_not_halved_for_ever(tmp_path: Path, sampling: dict[str, int], widest: float) -> None:
+    """Interpolation misses by half of the jump in any interval that holds it: by 0.45 of the largest displacement."""
+    chosen = study(**sampling)
+    samples, rounds = sample_by_bisection(chosen, sweep_of(step, chosen, tmp_path))
+    (place,) = rounds[-1]["unresolved"]
+    low, high = np.array(place["between"]) / 6e5
+    assert place["why"] == "jump"
+    assert low < 0.37 < high
+    assert high - low <= widest
+    assert place["estimate"] == pytest.approx(0.5 / 1.1, rel=0.1)
+    assert len(samples) < 35
+
+
+def test_what_was_not_reached_is_said_and_no_jump_is_made_of_it(tmp_path: Path) -> None:
+    """Waves shorter than the samples are apart, and bends wherever they lie; a line is all right."""
+    waves = study(training=21)
+    _, rounds = sample_by_bisection(
+        waves, sweep_of(lambda t: (np.sin(60.0 * t), 60.0 * np.cos(60.0 * t)), waves, tmp_path)
+    )
+    assert {place["why"] for place in rounds[-1]["unresolved"]} == {"training"}
+    assert max(place["estimate"] for place in rounds[-1]["unresolved"]) > 0.05
+    for at in np.linspace(0.13, 0.87, 9):
+        bent = study(training=15)
+        _, rounds = sample_by_bisection(
+            bent, sweep_of(lambda t, at=at: (max(t - at, 0.0), float(t > at)), bent, tmp_path)
+        )
+        for place in rounds[-1].get("unresolved", []):
+            assert place["why"] == "training"
+            assert place["between"][0] <= 6e5 * at <= place["between"][1]
+    line = study()
+    _, rounds = sample_by_bisection(line, sweep_of(lambda t: (t, 1.0), line, tmp_path))
+    assert "unresolved" not in rounds[-1]
+
+
+@pytest.mark.parametrize(("function", "why"), [(step, "jump"), (bend, "failed")])
+def test_where_no_solution_is_found_the_error_is_not_forgotten(tmp_path: Path, function: Callable, why: str) -> None:
+    """Solutions around the jump, or the bend, are missing: samples there stop, and the interval is named."""
+    chosen, place = study(), 0.37 if function is step else 0.3
+
+    def sweep(samples: Array) -> SweepResult:
+        result = sweep_of(function, chosen, tmp_path)(samples)
+        near = np.flatnonzero(np.abs(samples[:, 0] / 6e5 - place) < 0.01)
+        for index in near:
+            result.failed[int(index)] = "no equilibrium"
+            del result.solved[int(index)]
+        return result
+
+    _, rounds = sample_by_bisection(chosen, sweep)
+    (found,) = rounds[-1]["unresolved"]
+    low, high = np.array(found["between"]) / 6e5
+    assert found["why"] == why
+    assert low < place < high
+    assert high - low <= 0.25
+
+
+def test_a_body_that_rests_at_the_first_samples_is_looked_at_again(tmp_path: Path) -> None:
+    """sin^2 of 4 pi t vanishes at the five samples that come first; all of it is missed, then."""
+    chosen = study(training=40)
+    samples, rounds = sample_by_bisection(
+        chosen,
+        sweep_of(
+            lambda t: (
+                np.sin(4 * np.pi * t) ** 2 * (abs(np.sin(4 * np.pi * t)) > 1e-9),
+                4 * np.pi * np.sin(8 * np.pi * t),
+            ),
+            chosen,
+            tmp_path,
+        ),
+    )
+    assert rounds[0]["largest_estimate"] == pytest.approx(1.0)
+    assert len(samples) > 15
+
+
 def test_a_study_may_choose_otherwise() -> None:
     own = study(held_out=7, first=6).sampling
     assert (own.scheme, own.first, own.held_out) == ("adaptive", 6, 7)

@@ -35,6 +35,24 @@ def test_what_is_rounding_is_left_out():
     assert reaction_names(snapshots, 0.1) == ["force_bottom", "force_top", "moment_bottom"]
 
 
+def test_reactions_of_balanced_loads_are_rounding_and_small_ones_are_not():
+    """A finger of 60 mm under 20 kPa whose support feels 1e-12 N; a strip 200 mm long and 0.1 mm thick that is bent.
+
+    At 1 MPa the strip, 100 mm wide, carries sigma w t^2 / (6 l) = 0.8 mN at its end, and a moment of 0.17 N mm.
+    """
+
+    def solution(stress, force, moment):
+        fields = {"displacement": np.zeros((2, 3)), "stress_top": np.array([[stress, 0.0, 0.0], [0.0, 0.0, 0.0]])}
+        return Snapshot(
+            np.zeros(1), fields, {}, {"force_root": np.array([force, 0, 0]), "moment_root": moment * np.eye(3)[1]}
+        )
+
+    assert reaction_names([solution(2e4, 2e-12, 4e-13), solution(0.0, 0.0, 0.0)], 0.06) == []
+    bent = solution(1e6, 8.3e-4, 1.7e-4)
+    assert reaction_names([bent], 0.22) == ["force_root", "moment_root"]
+    assert reaction_names([solution(1e6, 1e-13, 1.7e-4)], 0.22) == ["moment_root"]
+
+
 def test_a_study_without_supports_has_no_reactions():
     bare = Snapshot(np.zeros(1), {"displacement": np.zeros((2, 3))}, {}, {"motion": np.ones(6)})
     assert reaction_names([bare], 1.0) == []

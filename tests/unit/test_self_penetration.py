@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.mechanics.contact import RigidPlane
+from morph_dslam.mechanics.contact import RigidCylinder, RigidPlane
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.meshes import model_mesh_of
@@ -107,3 +107,29 @@ def test_nodes_in_an_obstacle_are_named_with_the_state_and_the_depth():
     assert report["states"][0]["depth_mm"] == pytest.approx(200.0)
     report = obstacle_report(model_mesh_of(mesh), [moved], symbols, [(beside, mesh.set_nodes("x_max"))])
     assert report["states"][0]["depth_mm"] == pytest.approx(600.0)
+
+
+def test_an_obstacle_in_the_solid_comes_first_and_the_remedy_is_the_one_that_helps():
+    """A rod of 0.1 m radius moves up through a block of 1 m, whose faces meet nothing while it is in the middle."""
+    mesh, up = block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"), Parameter("up", "length", "m", 0.0, 2.0, 0.0)
+    symbols = ParameterSymbols([up])
+    rod = RigidCylinder("z_min", (0.3, 0.5, symbols["up"] - 0.2), (0.0, 1.0, 0.0), 0.1)
+    named = [(rod, mesh.set_nodes("z_min"))]
+
+    def state(up, lifted=0.0):
+        return Snapshot(np.array([up]), {"displacement": np.full((len(mesh.nodes), 3), [0.0, 0.0, lifted])})
+
+    beside = [state(0.0), state(1.5), state(0.5, lifted=0.6)]
+    clear = obstacle_report(model_mesh_of(mesh), beside, symbols, named)
+    assert clear["statement"] == "in none of 3 solutions the surface enters an obstacle"
+    report = obstacle_report(model_mesh_of(mesh), [*beside, state(0.45), state(0.7)], symbols, named)
+    assert sorted(found["coordinates"] for found in report["states"]) == [[0.45], [0.7]]
+    assert all(found["inside"] == ["the cylinder of the contact on 'z_min'"] for found in report["states"])
+    assert "in 2 of 5 solutions the cylinder of the contact on 'z_min' lies inside the solid" in report["statement"]
+    # At 1.25 m the rod is above the top but for its rim, and touches no node; a thicker one holds nodes of the top.
+    thick = RigidCylinder("z_min", (0.5, 0.5, symbols["up"] - 0.2), (0.0, 1.0, 0.0), 0.25)
+    report = obstacle_report(model_mesh_of(mesh), [state(1.25)], symbols, [(thick, mesh.set_nodes("z_min"))])
+    assert "the surface enters an obstacle, by 2e+02 mm" in report["statement"]
+    assert "name all surfaces" in report["statement"]
+    report = obstacle_report(model_mesh_of(mesh), [state(1.25)], symbols, [(thick, mesh.set_nodes("z_max"))])
+    assert report["statement"].endswith("make cells finer there")

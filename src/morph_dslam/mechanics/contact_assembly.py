@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.contact import Contact, RigidObstacle, RigidPlane, SurfaceContact
+from morph_dslam.mechanics.contact_passage import Placed, core_inside, passes_through, travel_in_depths
 from morph_dslam.mechanics.contact_search import Crossings, find_crossings, local_geometry
 from morph_dslam.mechanics.contact_surface import ContactSurface
 from morph_dslam.mechanics.kinematics import Shape
@@ -134,7 +135,10 @@ class _Entered:
 
 
 class ContactAssembly:
-    """All contacts of a solid. Raises StudyError if an obstacle that no parameter moves overlaps the undeformed solid.
+    """All contacts of a solid.
+
+    Raises StudyError if an obstacle that no parameter moves overlaps the undeformed solid, or the core of another lies
+    inside of it at the parameters' defaults.
 
     Parameters
     ----------
@@ -170,6 +174,7 @@ class ContactAssembly:
         return self._sides[name]
 
     def _check_apart(self) -> None:
+        self._check_outside()
         for contact, parts in zip(self._contacts, self._entered(np.zeros(3 * self._n)), strict=True):
             rigid = not isinstance(contact, SurfaceContact)
             if rigid and any(s.any() for s in contact.slopes(self._symbols)):
@@ -183,6 +188,42 @@ class ContactAssembly:
                     f"the {contact.name} reaches {1e3 * depth:.3g} mm into the undeformed surface '{contact.on}', "
                     f"deepest at ({where}) mm: {self._advice(contact)}"
                 )
+
+    def _check_outside(self) -> None:
+        """Refuse obstacles that no contact could push out of the undeformed solid."""
+        nodes = self._space.node_values @ self._shape.coordinates(self._symbols)
+        for contact in self._contacts:
+            if isinstance(contact, SurfaceContact):
+                continue
+            inside = core_inside(contact, self._symbols, nodes, self._mesh.surface_triangles())
+            if len(inside):
+                where = ", ".join(f"{1e3 * x:.4g}" for x in inside[len(inside) // 2])
+                state = f" where {self._symbols.text(self._symbols.default)}" if len(self._symbols) else ""
+                raise StudyError(
+                    f"the {contact.name} of the contact on '{contact.on}' lies inside the undeformed solid, its middle "
+                    f"at ({where}) mm{state}: have it outside there, and let a parameter push it in"
+                )
+
+    def strides(self, begin: Array, end: Array) -> int:
+        """Parts of a path of parameters, (d,) to (d,), in each of which no obstacle moves by more than its radius."""
+        rigid = [contact for contact in self._contacts if not isinstance(contact, SurfaceContact)]
+        return max([1, *(int(np.ceil(travel_in_depths(body, self._symbols, begin, end))) for body in rigid)])
+
+    def passage(self, before: tuple[Array, Array], after: tuple[Array, Array]) -> str | None:
+        """What an obstacle has done between two solutions that it cannot do: go through a surface; None if nothing.
+
+        Solutions are displacements (3 n,) and parameters (d,); those of ``after`` are the present ones then.
+        """
+        states = []
+        for x, mu in (before, after):
+            self._symbols.set(mu)
+            states.append(Placed(mu, self._shape.coordinates(self._symbols) + x.reshape(3, -1).T))
+        for contact in self._contacts:
+            if isinstance(contact, SurfaceContact):
+                continue
+            if passes_through(contact, self._symbols, self._side(contact.on).surface, states[0], states[1]):
+                return f"the {contact.name} passes through the surface '{contact.on}'"
+        return None
 
     def _advice(self, contact: Contact) -> str:
         """What to do about an obstacle that overlaps the undeformed solid."""

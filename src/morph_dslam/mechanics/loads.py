@@ -156,7 +156,7 @@ class MovingPatch:
     on : surface.
     force : N.
     centre : m, expressions of the parameter that is the position.
-    width : w, m; at least about half an element, or quadrature misses it.
+    width : w, m; at least half a cell of the surface, or quadrature misses it.
     """
 
     on: str
@@ -179,7 +179,8 @@ class MovingPatch:
 class MovingLine:
     """Dead force along a straight line that moves over a surface, with a Gaussian density across it.
 
-    t(X) = force exp(-r^2 / 2 w^2) / (sqrt(2 pi) w), r the distance of X from the line.
+    t(X) = force exp(-r^2 / 2 w^2) / (sqrt(2 pi) w), r the distance of X from the line. Where that is nearer than 4
+    widths to the surface's rim, a part of the force falls beside it, as of a patch.
 
     Attributes
     ----------
@@ -187,7 +188,7 @@ class MovingLine:
     force : per length of the line, N/m.
     centre : a point of the line, m, expressions of the parameter that is the position.
     direction : (3,) of the line; its length does not matter.
-    width : w, m; at least about half an element, or quadrature misses it.
+    width : w, m; at least half a cell of the surface, or quadrature misses it.
     """
 
     on: str
@@ -253,12 +254,16 @@ class NodalForces:
         return slopes.reshape(len(self._symbols), -1)
 
 
-#: A reaction that never exceeds so much of the largest is rounding, and has nothing to be reduced.
-NEGLIGIBLE = 1e-6
+#: A reaction that never exceeds so much of the largest is rounding, and has nothing to be reduced; nor has one that
+#: never exceeds so much of what the stresses of the body could exert on the square of its size.
+NEGLIGIBLE, NEGLIGIBLE_OF_STRESS = 1e-6, 1e-9
 
 
 def reaction_names(snapshots: Sequence[Snapshot], size: float) -> list[str]:
     """Outputs that are forces and moments on supports and do not vanish in all of the snapshots.
+
+    Loads that balance each other, a pressure inside of a body say, leave no reaction but rounding: so reactions count
+    against the stresses too, where snapshots have any.
 
     Parameters
     ----------
@@ -268,8 +273,17 @@ def reaction_names(snapshots: Sequence[Snapshot], size: float) -> list[str]:
     names = [name for name in snapshots[0].outputs if name.startswith((FORCE, MOMENT))]
     largest = {name: max(float(np.linalg.norm(s.outputs[name])) for s in snapshots) for name in names}
     force = max((value if name.startswith(FORCE) else value / size for name, value in largest.items()), default=0.0)
-    limit = {FORCE: NEGLIGIBLE * force, MOMENT: NEGLIGIBLE * force * size}
+    least = NEGLIGIBLE * force
+    if force > 0.0:
+        least = max(least, NEGLIGIBLE_OF_STRESS * size**2 * max(_typical_stress(snapshot) for snapshot in snapshots))
+    limit = {FORCE: least, MOMENT: least * size}
     return [name for name in names if largest[name] > limit[name[: name.index("_") + 1]]]
+
+
+def _typical_stress(snapshot: Snapshot) -> float:
+    """Root of the mean square over the nodes, Pa, of the face where it is largest; 0 without stresses."""
+    stresses = [snapshot.fields[name].astype(np.float64) for name in snapshot.fields if name.startswith("stress_")]
+    return max((float(np.sqrt(np.mean(np.sum(stress**2, axis=1)))) for stress in stresses), default=0.0)
 
 
 def with_reactions(snapshot: Snapshot, names: Sequence[str]) -> Snapshot:

@@ -15,7 +15,7 @@ import trimesh
 from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import NdBSpline, make_interp_spline
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, maximum_filter
 from scipy.spatial import KDTree
 
 from morph_dslam.errors import StudyError
@@ -39,6 +39,8 @@ LARGEST_JUMP = 1.5
 #: A surface is too thin for the grid where the distance grows by less than the first share of that along its normal, in
 #: more than the second share of its area. Edges and corners of boxes have none, a wedge of 20 degrees 2.5 %.
 LEAST_SLOPE, LARGEST_FLAT = 0.5, 0.1
+#: Points along the longest side of the body among which its core is found.
+CORE_POINTS = 24
 #: Surfaces are off by less than such a part of the spacing, near edges.
 ROUNDING = 0.2
 
@@ -99,6 +101,17 @@ class RigidMesh:
         distance = NdBSpline(tuple(knots), np.ascontiguousarray(coefficients), 3)
         self._check_thickness(distance)
         return distance
+
+    @cached_property
+    def core(self) -> Array:
+        """Points (k, 3) that are deeper inside than others around them, where ``points`` are, m: none in thin walls."""
+        low, sides = self.points.min(axis=0), np.ptp(self.points, axis=0)
+        counts = np.maximum(np.ceil(CORE_POINTS * sides / sides.max()).astype(int), 2)
+        axes = [start + side * (np.arange(n) + 0.5) / n for start, side, n in zip(low, sides, counts, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        depths = -self._distance(grid)
+        deepest = (depths > self._step) & (depths >= maximum_filter(depths, size=3))
+        return grid[deepest]
 
     def _check_sides(self, grid: Array, distances: Array) -> None:
         """Raise StudyError if the signed distance from inside to outside of the surface jumps.

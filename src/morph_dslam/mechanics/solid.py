@@ -320,6 +320,15 @@ class SolidProblem:
             self.history.advance(self.recovery.deformation_gradient(x))
             self._latest = None
 
+    def passage(self, before: State, after: State) -> str | None:
+        """See `continuation.refuse_passage`."""
+        n = 3 * self.displacements.n_scalar
+        return self.contact.passage((before.dofs[:n], before.mu), (after.dofs[:n], after.mu)) if self.contact else None
+
+    def strides(self, begin: Array, end: Array) -> int:
+        """See `continuation.advance`."""
+        return self.contact.strides(begin, end) if self.contact else 1
+
     def _set(self, mu: Array) -> None:
         self.symbols.set(mu)
         if self.history:

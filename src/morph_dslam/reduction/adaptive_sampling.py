@@ -40,7 +40,8 @@ def sample_adaptively(
     """The training samples (n, d), all of them solved, and what each round found.
 
     Sampling ends when the largest estimate is below the tolerance of the reduction, or at
-    ``sampling.training`` samples.
+    ``sampling.training`` samples. In the second case the last round has as "unresolved" the candidate of the largest
+    estimate, if that is above the tolerance: "at" (coordinates, SI), "estimate", and "why", "training".
     """
     equations = solid_equations(problem)
     samples = training_samples(study)
@@ -58,6 +59,8 @@ def sample_adaptively(
         worst, estimates = _worst(solver, candidates, estimates, count)
         largest = float(estimates[worst[0]])
         rounds.append({"solves": len(samples), "largest_estimate": largest})
+        if largest > study.reduction.tolerance and room <= 0:
+            rounds[-1]["unresolved"] = [{"at": candidates[worst[0]].tolist(), "estimate": largest, "why": "training"}]
         if largest <= SHARE * study.reduction.tolerance or room <= 0:
             return samples, rounds
         estimates[worst] = -np.inf

@@ -2,13 +2,16 @@
 
 Each interval between two samples is checked by a solve in its middle, predicted by the functions that the model will
 use (`line_functions`). Where the prediction misses by more than the tolerance, both halves are checked too. The middle
-becomes a sample of the model, which so errs less than was measured: for a smooth function by a sixteenth of it. Which
-samples are taken depends on solutions alone: a build that was stopped takes them again and finds them on disk.
+becomes a sample of the model, which so errs less than was measured: for a smooth function by a sixteenth of it. Where
+solutions jump it errs by as much as before, only in a shorter interval. Which samples are taken depends on solutions
+alone: a build that was stopped takes them again and finds them on disk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,37 @@ from morph_dslam.studies.snapshots import load_snapshot
 from morph_dslam.studies.sweep import SweepResult
 
 Array = NDArray[np.float64]
+#: An error that is still more than these parts of the one before and of the one before that does not fall.
+STEADY, STEADY_TWICE = 0.75, 0.6
+#: Intervals in which errors do not fall are halved until they are shorter than this part of the range.
+LEAST = 1e-3
+
+
+@dataclass(frozen=True)
+class _Interval:
+    """Of the parameter, between two samples; ``errors`` in the middles of the intervals that it is a half of."""
+
+    low: float
+    high: float
+    errors: tuple[float, ...] = ()
+
+    @property
+    def middle(self) -> float:
+        return (self.low + self.high) / 2.0
+
+    def halves(self, error: float) -> list[_Interval]:
+        """Both, where the middle errs by so much."""
+        errors = (*self.errors, error)
+        return [_Interval(self.low, self.middle, errors), _Interval(self.middle, self.high, errors)]
+
+    @property
+    def steady(self) -> bool:
+        """Whether the error has not fallen as intervals were halved; that of a bend falls to a half at least.
+
+        Two halvings tell: where a bend lies by chance, the error of a single one need not fall.
+        """
+        last = self.errors[-3:]
+        return len(last) == 3 and last[2] > max(STEADY * last[1], STEADY_TWICE * last[0])
 
 
 def sample_by_bisection(
@@ -29,27 +63,69 @@ def sample_by_bisection(
     """The training samples (n, 1) and what each round found, as `adaptive_sampling.sample_adaptively` has it.
 
     Sampling ends when no middle misses the tolerance of the reduction, a norm over the body relative to the largest
-    displacement, or at ``sampling.training`` samples.
+    displacement, or at ``sampling.training`` samples. Intervals are halved no further where solutions jump. The last
+    round has "unresolved" intervals in which the tolerance was missed and that were not halved: "between" (two
+    coordinates, SI), "estimate" in the middle of the interval that it is a half of, and "why": "jump" where solutions
+    do, "failed" where the middle could not be solved, "training" where samples ran out.
     """
-    weights = study.model_mesh().weights
+    weights, tolerance = study.model_mesh().weights, study.reduction.tolerance
     samples = even_samples(study, study.sampling.first)
     solved = sweep(samples).solved
-    intervals = np.column_stack([samples[:-1], samples[1:]])
+    waiting = [_Interval(float(low), float(high)) for low, high in pairwise(samples[:, 0])]
+    least = LEAST * (samples[-1, 0] - samples[0, 0])
     rounds: list[dict[str, Any]] = []
-    while len(intervals := intervals[: study.sampling.training - len(samples)]):
+    left: list[_Interval] = []
+    failed: list[_Interval] = []
+    while waiting:
+        room = max(study.sampling.training - len(samples), 0)
+        waiting, left = waiting[:room], left + waiting[room:]
+        if not waiting:
+            break
         line = _Line([load_snapshot(path) for _, path in sorted(solved.items())], weights)
-        middles = intervals.mean(axis=1)
-        samples = np.vstack([samples, middles[:, None]])
+        samples = np.vstack([samples, [[interval.middle] for interval in waiting]])
         solved = sweep(samples).solved
-        new = range(len(samples) - len(middles), len(samples))
+        new = range(len(samples) - len(waiting), len(samples))
         # What cannot be solved is not looked at any closer.
+        failed += [part for part, index in zip(waiting, new, strict=True) if index not in solved]
         errors = np.array([line.error(load_snapshot(solved[index])) if index in solved else 0.0 for index in new])
         rounds.append({"solves": len(samples), "largest_estimate": float(errors.max())})
         # The worst first, in case samples run out.
-        worst = [index for index in np.argsort(-errors, kind="stable") if errors[index] > study.reduction.tolerance]
-        halves = np.column_stack([intervals[:, 0], middles, middles, intervals[:, 1]])[worst]
-        intervals = halves.reshape(-1, 2)
+        worst = [index for index in np.argsort(-errors, kind="stable") if errors[index] > tolerance]
+        halves = [half for index in worst for half in waiting[index].halves(float(errors[index]))]
+        waiting = [half for half in halves if half.high - half.low > least or not half.steady]
+        left += [half for half in halves if half not in waiting]
+    if missed := [*failed, *(part for part in left if part.errors)]:
+        line = _Line([load_snapshot(path) for _, path in sorted(solved.items())], weights)
+        if found := _unresolved(missed, set(failed), line, least):
+            rounds[-1]["unresolved"] = found
     return samples, rounds
+
+
+def _unresolved(
+    missed: Sequence[_Interval], failed: Collection[_Interval], line: _Line, least: float
+) -> list[dict[str, Any]]:
+    """What is said of intervals that were not halved; shorter ones than ``least`` jump whatever their slopes are.
+
+    One without errors, whose middle could not be solved, is only known by its ends.
+    """
+    steady = [part for part in missed if part.steady or not part.errors]
+    jumps = [part for part in steady if line.jumps(part, part.high - part.low > least)]
+    found: list[dict[str, Any]] = []
+    for part in sorted(missed, key=lambda part: part.low):
+        width = part.high - part.low
+        # Where the other half has the jump, this one has only its error.
+        beside = any(part.low - width <= jump.low and jump.high <= part.high + width for jump in jumps)
+        if part not in jumps and (beside or not part.errors):
+            continue
+        why = "jump" if part in jumps else "failed" if part in failed else "training"
+        estimate = part.errors[-1] if part.errors else line.step(part) / 2.0
+        entry = {"between": [part.low, part.high], "estimate": estimate, "why": why}
+        if found and why != "jump" and (found[-1]["between"][1], found[-1]["why"]) == (part.low, why):
+            before = found.pop()
+            entry["between"] = [before["between"][0], part.high]
+            entry["estimate"] = max(estimate, before["estimate"])
+        found.append(entry)
+    return found
 
 
 class _Line:
@@ -60,14 +136,44 @@ class _Line:
         values = np.array([snapshot.fields["displacement"].ravel() for snapshot in snapshots], dtype=np.float64)
         slopes = [s.sensitivities["displacement"].ravel() for s in snapshots if "displacement" in s.sensitivities]
         self._weights = np.repeat(weights, 3)
-        self._functions = interpolate_line(points, values, np.array(slopes, dtype=np.float64) if slopes else None)
-        self._largest = max(self._norm(value) for value in values)
+        self._slopes = np.array(slopes, dtype=np.float64) if slopes else None
+        self._points, self._values = points, values
+        self._functions = interpolate_line(points, values, self._slopes)
+        self._largest = max(self._norm(value) for value in values)  # zero for a body that has not moved yet
 
     def _norm(self, displacement: Array) -> float:
         return float(np.sqrt(displacement**2 @ self._weights))
 
     def error(self, snapshot: Snapshot) -> float:
-        """Norm of the error at another snapshot, relative to the largest displacement."""
+        """Norm of the error at another snapshot, relative to the largest displacement, that one's included."""
         predicted, _ = self._functions.evaluate(snapshot.coordinates)
-        missed = self._norm(predicted - snapshot.fields["displacement"].ravel())
-        return missed / self._largest if missed else 0.0
+        truth = snapshot.fields["displacement"].ravel()
+        missed = self._norm(predicted - truth)
+        return missed / max(self._largest, self._norm(truth)) if missed else 0.0
+
+    def _ends(self, interval: _Interval) -> tuple[int, int] | None:
+        """The snapshots at both ends; None if one of them could not be solved."""
+        low, high = (int(np.abs(self._points - end).argmin()) for end in (interval.low, interval.high))
+        width = interval.high - interval.low
+        found = abs(self._points[high] - self._points[low] - width) <= 1e-6 * width
+        return (low, high) if found else None
+
+    def step(self, interval: _Interval) -> float:
+        """Norm of the difference between both ends, relative to the largest displacement; 0 where it is unknown."""
+        ends = self._ends(interval)
+        if ends is None or not self._largest:
+            return 0.0
+        return self._norm(self._values[ends[1]] - self._values[ends[0]]) / self._largest
+
+    def jumps(self, interval: _Interval, by_slopes: bool) -> bool:
+        """Whether solutions at both ends differ by as much as the error in the middle of what is twice as long says.
+
+        ``by_slopes`` asks besides that they differ by more than their slopes explain, where these are known.
+        """
+        step, ends = self.step(interval), self._ends(interval)
+        if ends is None or step == 0.0 or (interval.errors and step < interval.errors[-1]):
+            return False  # what jumps is the other half
+        if self._slopes is None or not by_slopes:
+            return bool(interval.errors)
+        width = interval.high - interval.low
+        return step * self._largest > width * sum(self._norm(self._slopes[end]) for end in ends)

@@ -104,6 +104,8 @@ def plot_convergence(model: ReducedModel, reference: ReferenceCurve | None) -> P
     """Error of the model cut to its first modes, and singular values if the method states them."""
     errors = model.certificate["displacement"]["mean_mm_by_modes"]
     singular_values = model.certificate.get("reduction", {}).get("singular_values")
+    if singular_values and not singular_values[0] > 0.0:
+        singular_values = None  # the body never moves
     figure, axes = _panels(2 if singular_values else 1, 3.4)
     _draw_errors(axes[0], errors, reference)
     caption = "Left: mean displacement error over all nodes and held-out solves, of the first modes alone."
@@ -114,7 +116,8 @@ def plot_convergence(model: ReducedModel, reference: ReferenceCurve | None) -> P
 
 
 def _draw_errors(axes: Axes, errors: Sequence[float], reference: ReferenceCurve | None) -> None:
-    axes.semilogy(range(1, len(errors) + 1), errors, "o-", color=OURS, markersize=4, label="this model")
+    drawn = np.maximum(errors, LEAST_MM)
+    axes.semilogy(range(1, len(errors) + 1), drawn, "o-", color=OURS, markersize=4, label="this model")
     if reference is not None:
         axes.semilogy(reference.modes, reference.mean_mm, "s--", color=REFERENCE, markersize=3, label=reference.label)
         axes.legend(frameon=False)

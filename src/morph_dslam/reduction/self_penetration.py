@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.mechanics.contact import RigidObstacle
+from morph_dslam.mechanics.contact_passage import core_inside
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.model import Parameter
 from morph_dslam.studies.problem import ModelMesh, Snapshot
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 NEARER = 0.5
 #: Nodes that are less deep than such a part of the solid's extent only touch.
 TOUCHING = 1e-4
+#: What to do about an obstacle inside the solid.
+FELT = "contact is felt at points of the surface alone, so make cells finer than the obstacle"
 
 
 def penetration_report(
@@ -65,7 +68,9 @@ def obstacle_report(
 ) -> dict[str, Any]:
     """What a certificate says of solutions whose surface is in an obstacle, as `penetration_report`.
 
-    Nodes that were in an obstacle at rest, and that no contact keeps out of it, are not meant to be outside.
+    Nodes that were in an obstacle at rest, and that no contact keeps out of it, are not meant to be outside. A state
+    in which the core of an obstacle lies in the solid, where no contact may see it, has besides "inside", what messages
+    call these obstacles; such states come first.
 
     Parameters
     ----------
@@ -73,26 +78,68 @@ def obstacle_report(
     obstacles : each with the nodes that its contact names.
     """
     on_surface, states = np.unique(mesh.triangles), []
+    named = np.unique(np.concatenate([nodes for _, nodes in obstacles]))
     symbols.set(symbols.default)
     meant = []
-    for obstacle, named in obstacles:
+    for obstacle, own in obstacles:
         outside = obstacle.touch(symbols, mesh.nodes[on_surface]).gap >= 0.0
-        meant.append(on_surface[outside | np.isin(on_surface, named)])
+        meant.append(on_surface[outside | np.isin(on_surface, own)])
+    bodies = [obstacle for obstacle, _ in obstacles]
     for solution in solutions:
         symbols.set(solution.coordinates)
         places = mesh.nodes + solution.fields["displacement"]
         depths = [
             -obstacle.touch(symbols, places[nodes]).gap - obstacle.tolerance
-            for (obstacle, _), nodes in zip(obstacles, meant, strict=True)
+            for obstacle, nodes in zip(bodies, meant, strict=True)
         ]
-        states += _deep(mesh, solution, np.concatenate(depths))
-    return _report(
-        symbols.parameters,
-        len(solutions),
-        states,
-        "the surface enters an obstacle",
-        "name all surfaces that meet it in [[contacts]], or make cells finer",
-    )
+        entered = np.concatenate(depths), np.concatenate(meant)
+        states += _in_obstacles(mesh, solution, entered, named, _enclosed(bodies, symbols, places, mesh.triangles))
+    # Those that hold an obstacle come first, and stay so where all are sorted by depth.
+    holding = [state for state in states if "inside" in state]
+    others = [state for state in states if "inside" not in state]
+    report = _report(symbols.parameters, len(solutions), others, "the surface enters an obstacle", _remedy(others))
+    if not holding:
+        return report
+    what = f"{holding[0]['inside'][0]} lies inside the solid"
+    return _report(symbols.parameters, len(solutions), holding, what, FELT) | {"states": holding + others}
+
+
+def _enclosed(
+    bodies: Sequence[RigidObstacle], symbols: ParameterSymbols, places: Array, triangles: NDArray[np.int64]
+) -> dict[str, float]:
+    """Obstacles whose core lies in the solid with nodes at ``places`` (n, 3), and how deep in it, m."""
+    found = {}
+    for body in bodies:
+        inside = core_inside(body, symbols, places, triangles)
+        if len(inside):
+            away = KDTree(places[np.unique(triangles)]).query(inside)[0]
+            found[f"the {body.name} of the contact on '{body.on}'"] = float(np.max(away))
+    return found
+
+
+def _in_obstacles(
+    mesh: ModelMesh,
+    solution: Snapshot,
+    entered: tuple[Array, NDArray[np.int64]],
+    named: NDArray[np.int64],
+    enclosed: dict[str, float],
+) -> list[dict[str, Any]]:
+    """One state, if nodes are more than touching by depths (k,), of nodes (k,), or obstacles are ``enclosed``."""
+    depths, nodes = entered
+    states = _deep(mesh, solution, depths)
+    for state in states:
+        state["named"] = bool(np.isin(nodes[depths.argmax()], named))
+    if enclosed:
+        found = states[0] if states else {"coordinates": solution.coordinates.tolist(), "nodes": 0, "depth_mm": 0.0}
+        deepest = max(found["depth_mm"], 1e3 * max(enclosed.values()))
+        states = [found | {"depth_mm": deepest, "inside": list(enclosed)}]
+    return states
+
+
+def _remedy(states: Sequence[dict[str, Any]]) -> str:
+    """What to do about nodes in an obstacle: those that no contact names come in freely, others as cells give way."""
+    worst = max(states, key=lambda state: state["depth_mm"], default={"named": True})
+    return "make cells finer there" if worst["named"] else "name all surfaces that meet it in [[contacts]]"
 
 
 def _deep(mesh: ModelMesh, solution: Snapshot, depths: Array) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from morph_dslam.errors import StudyError
+from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
 from morph_dslam.model import ReducedModel, save_model
@@ -23,6 +25,7 @@ from morph_dslam.reduction.self_penetration import obstacle_report, penetration_
 from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.discretisation import discretisation_errors
+from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import announce
 from morph_dslam.studies.provenance import locking_warnings, provenance
 from morph_dslam.studies.sections import ReductionSection
@@ -37,8 +40,22 @@ from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 FEWEST_HELD_OUT = 4
 #: Responses to unknown loads that are off by more than this share are not to be trusted.
 LARGEST_RESPONSE_ERROR = 0.1
-#: A displacement that is a smaller share of the body's size is none.
-UNSTRAINED = 1e-7
+#: A displacement that is a smaller share of the body's size is none: of a body that only moves, and of any.
+UNSTRAINED, UNMOVED = 1e-7, 1e-14
+MISSED = {
+    "training": (
+        "sampling ended at sampling.training = {count} solutions with {error} {where}, where the tolerance is "
+        "{tolerance}: allow more, or narrow {ranges}"
+    ),
+    "failed": (
+        "the model has {error} {where}, where the tolerance is {tolerance} and a solution in between was not found: "
+        "narrow {ranges}"
+    ),
+}
+UNMOVED_BODY = (
+    "no solution moves the body: its loads are zero, miss it or act where it is held, or no obstacle reaches it; check "
+    "their sets, places and ranges"
+)
 UNSURE_LOADS = (
     "responses to unknown loads are off by {:.0f} % between the states where they are known: narrow the ranges of the "
     "parameters"
@@ -92,7 +109,8 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     if isinstance(chosen, SolidStudy | ShellStudy):
         chosen.check_parameters_used()
         _announce_mesh(chosen)
-    snapshots = take_snapshots(chosen, output.with_name(output.name + ".snapshots"), workers, executor)
+    snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
+    _check_held_out(chosen, snapshots, output)
     model = certified_model(snapshots, chosen.reduction, chosen.name)
     if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
         solutions = [*(group[0] for group in snapshots.training), *snapshots.held_out]
@@ -103,10 +121,16 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         model = replace(model, unknown_loads=loads)
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
-    if found := [*locking_warnings(chosen), *(_unstrained(snapshots) or _doubtful(model))]:
+    doubts = _unstrained(snapshots) or _doubtful(model)
+    if found := [*_unresolved(chosen, snapshots), *locking_warnings(chosen), *doubts]:
         model.certificate["warnings"] = found
     save_model(output, model)
     return model
+
+
+def _kept_in(output: Path) -> Path:
+    """Folder of the solutions of a model file."""
+    return output.with_name(output.name + ".snapshots")
 
 
 def _announce_mesh(study: SolidStudy | ShellStudy) -> None:
@@ -125,9 +149,11 @@ def _announce_mesh(study: SolidStudy | ShellStudy) -> None:
 
 
 def _unstrained(snapshots: Snapshots) -> list[str]:
-    """A sentence if every solution only moves the body without deforming it."""
+    """A sentence if no solution moves the body, or every one only moves it without deforming it."""
     nodes, moves = snapshots.mesh.nodes, [group[0].fields["displacement"] for group in snapshots.training]
     size, largest = float(np.linalg.norm(np.ptp(nodes, axis=0))), max(float(np.abs(move).max()) for move in moves)
+    if not largest > UNMOVED * size:
+        return [UNMOVED_BODY]
     if not largest > UNSTRAINED * size:
         return []
     for move in moves:
@@ -135,6 +161,49 @@ def _unstrained(snapshots: Snapshots) -> list[str]:
         if np.abs(fit.apply(nodes) - nodes - move).max() > UNSTRAINED * max(size, largest):
             return []
     return ["no solution strains the body, all move it as if it were rigid: is a support missing?"]
+
+
+def _unresolved(study: Study, snapshots: Snapshots) -> list[str]:
+    """Sentences on where adaptive sampling has missed its tolerance: all jumps, and the worst of the rest."""
+    if isinstance(study, ExternalStudy) or not snapshots.rounds:
+        return []
+    places = sorted(snapshots.rounds[-1].get("unresolved", []), key=lambda place: -place["estimate"])
+    sentences = [_jump(snapshots, place) for place in places if place["why"] == "jump"]
+    parameters = snapshots.parameters
+    ranges = f"the range of {parameters[0].name}" if len(parameters) == 1 else "the ranges of the parameters"
+    for why, sentence in MISSED.items():
+        worst = next((place for place in places if place["why"] == why), None)
+        if worst is not None:
+            where = _between(snapshots, worst["between"]) if "between" in worst else _at(snapshots, worst["at"])
+            error = f"an estimated error of up to {100.0 * worst['estimate']:.2g} %"
+            error = error if np.isfinite(worst["estimate"]) else "no solution of the reduced equations"
+            tolerance = f"{100.0 * study.reduction.tolerance:.2g} %"
+            count = study.sampling.training
+            sentences.append(sentence.format(count=count, error=error, where=where, tolerance=tolerance, ranges=ranges))
+    return sentences
+
+
+def _at(snapshots: Snapshots, place: list[float]) -> str:
+    return f"at {describe_point(snapshots.parameters, place)}"
+
+
+def _between(snapshots: Snapshots, ends: list[float]) -> str:
+    """An interval of the only parameter, in words."""
+    (parameter,) = snapshots.parameters
+    low, high = (f"{parameter.display(end):.6g}" for end in ends)
+    return f"between {parameter.name} = {low} and {high} {parameter.unit}".removesuffix(" 1")
+
+
+def _jump(snapshots: Snapshots, place: dict[str, Any]) -> str:
+    """A sentence on an interval in which solutions jump."""
+    low, high = place["between"]
+    within = sum(low < snapshot.coordinates[0] < high for snapshot in snapshots.held_out)
+    counted = f"of the {len(snapshots.held_out)} held-out solutions that measure the errors, {within or 'none'} "
+    return (
+        f"solutions jump {_between(snapshots, [low, high])}: there the model is off by up to "
+        f"{100.0 * place['estimate']:.2g} % of the largest displacement, and {counted}"
+        f"{'lie' if within > 1 else 'lies'} there; build each side by itself"
+    )
 
 
 def _doubtful(model: ReducedModel) -> list[str]:
@@ -145,6 +214,10 @@ def _doubtful(model: ReducedModel) -> list[str]:
 
 def _read(study: str | Path | Study) -> tuple[Study, str]:
     """A study and the text that says what it is."""
+    if isinstance(study, Mapping):
+        raise StudyError(
+            "build takes a study or its file, and this is a dictionary: make it a study with md.make_study"
+        )
     if not isinstance(study, str | Path):
         return study, study.model_dump_json()
     path = _file_of(study)
@@ -156,17 +229,29 @@ def _file_of(study: str | Path) -> Path:
     return path / "study.toml" if path.is_dir() else path
 
 
+def _check_held_out(study: Study, snapshots: Snapshots, output: Path) -> None:
+    """Raise StudyError, with what to do, if too few held-out samples converged to measure the error of a model."""
+    count = len(snapshots.held_out)
+    if isinstance(study, ExternalStudy) or count >= FEWEST_HELD_OUT:
+        return
+    # Held-out samples are the last.
+    failed = snapshots.failed[-(study.sampling.held_out - count)]
+    raise StudyError(
+        f"only {count} of {study.sampling.held_out} held-out samples could be solved, too few to certify the model; "
+        f"the first failure: {_at(snapshots, failed['coordinates'])}, {failed['reason']}. The solved ones are kept in "
+        f"{_kept_in(output)}. {study.advice}, or take more with sampling.held_out"
+    )
+
+
 def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) -> ReducedModel:
     """The reduced model of the training solutions, with its errors at the held-out ones.
 
     Raises
     ------
     StudyError
-        If the method does not suit the solutions, or too few of them are left to measure the error.
+        If the method does not suit the solutions.
     """
     training, held_out = snapshots.training, snapshots.held_out
-    if len(held_out) < FEWEST_HELD_OUT:
-        raise StudyError(f"only {len(held_out)} held-out samples converged: too few to certify the model")
     method = reduction_method(options.method or "pod")
     task = ReductionTask(
         snapshots.mesh, snapshots.parameters, training, options, name, snapshots.problem, snapshots.training_files

@@ -7,7 +7,7 @@ Numerical Continuation Methods, 1990, section 6.3). A smooth path then takes lit
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -29,8 +29,11 @@ Array = NDArray[np.float64]
 AnyState = TypeVar("AnyState")
 #: Highest degree of the polynomial that predicts the next solution.
 MOST_DEGREE = 4
-#: The path is given up when an increment falls below this part of it.
+#: The path is given up when an increment falls below this part of it, or of a stride.
 SMALLEST_INCREMENT = 1.0 / 64.0
+LIMIT_POINT = (
+    "A load that the body cannot carry (a limit point) needs arc length, or an imposed displacement in its place"
+)
 
 
 @runtime_checkable
@@ -40,15 +43,37 @@ class _History(Protocol):
     def advance_history(self, x: Array, mu: Array) -> None: ...
 
 
+class PassageError(SolverError):
+    """The body and an obstacle have passed through each other."""
+
+
 class PathError(SolverError):
-    """The path could not be followed to its end; ``states`` keeps what was solved."""
+    """The path could not be followed to its end.
 
-    def __init__(self, message: str, states: list[State]) -> None:
+    Attributes
+    ----------
+    states : what was solved.
+    passage : what would have passed through an obstacle further on; None if that is not what ends the path.
+    """
+
+    def __init__(self, message: str, states: list[State], passage: str | None = None) -> None:
         super().__init__(message)
-        self.states = states
+        self.states, self.passage = states, passage
 
 
-def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState) -> AnyState:
+def refuse_passage(equations: Equations, before: State, after: State) -> None:
+    """Raise PassageError if body and obstacles pass through each other between two solutions.
+
+    Equations with obstacles say so by a method ``passage`` of both solutions: in words, or None. Contact sees where
+    things are, not how they came there; so an increment that is too large may leave out what is between.
+    """
+    passage = getattr(equations, "passage", None)
+    found = None if passage is None else passage(before, after)
+    if found is not None:
+        raise PassageError(f"{found} on the way from {where(equations, before.mu)} to {where(equations, after.mu)}")
+
+
+def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState, strides: int = 1) -> AnyState:
     """The state at the end of a path, in one increment if possible; they shrink on failure and grow again.
 
     Raises SolverError if the increments become too small.
@@ -57,15 +82,16 @@ def step_towards(attempt: Callable[[float, AnyState], AnyState], start: AnyState
     ----------
     attempt : solves at a fraction of the path from a solved state.
     start : state at fraction 0.
+    strides : the first increment is one of so many, and others may shrink to a share of that.
     """
-    state, done, increment = start, 0.0, 1.0
+    state, done, increment = start, 0.0, 1.0 / strides
     while done < 1.0:
         step = min(increment, 1.0 - done)
         try:
             state = attempt(done + step, state)
         except SolverError as error:
             increment = step / 2.0
-            if increment < SMALLEST_INCREMENT:
+            if increment * strides < SMALLEST_INCREMENT:
                 raise SolverError(f"{error}, {100.0 * done:.0f} % of the way from a solved state") from error
             continue
         done += step
@@ -115,6 +141,9 @@ class _Extrapolation:
 def advance(equations: Equations, start: State, target: Array, tolerance: float = TOLERANCE) -> list[State]:
     """Solve at ``target``, along straight lines, in increments as large as converge.
 
+    Equations with moving obstacles have a method ``strides`` of two parameter points: in how many parts of the line
+    between them no obstacle moves by more than its radius. Increments may be as much smaller.
+
     Raises PathError naming the last parameters that converged; it carries the states up to there.
 
     Parameters
@@ -135,11 +164,9 @@ def advance(equations: Equations, start: State, target: Array, tolerance: float 
             path.lead_to(goal, number)
     except SolverError as error:
         last = where(equations, path.states[-1].mu)
-        raise PathError(
-            f"{error}; the last parameters that converged are {last}. A load that the body cannot "
-            "carry (a limit point) needs arc length, or an imposed displacement in its place",
-            path.states,
-        ) from error
+        passage = str(error.__cause__) if isinstance(error.__cause__, PassageError) else None
+        message = f"{error}; the last parameters that converged are {last}"
+        raise PathError(message if passage else f"{message}. {LIMIT_POINT}", path.states, passage) from error
     return path.states
 
 
@@ -162,7 +189,8 @@ class _Path:
         def attempt(fraction: float, _: State) -> State:
             return self._step(origin + fraction * (goal - origin), number + fraction)
 
-        step_towards(attempt, self.states[-1])
+        strides = getattr(self._equations, "strides", None)
+        step_towards(attempt, self.states[-1], 1 if strides is None else strides(origin, goal))
 
     def _step(self, mu: Array, place: float) -> State:
         state = self._solve(mu, self._expected.at(place))
@@ -175,10 +203,15 @@ class _Path:
     def _solve(self, mu: Array, guess: Array | None) -> State:
         if guess is not None:
             try:
-                return solve(self._equations, mu, State(mu, guess), self._tolerance)
+                return self._reached(mu, State(mu, guess))
             except SolverError:
                 pass  # the path bends here: by its tangent it may go on
-        return solve(self._equations, mu, self.states[-1], self._tolerance)
+        return self._reached(mu, self.states[-1])
+
+    def _reached(self, mu: Array, start: State) -> State:
+        state = solve(self._equations, mu, start, self._tolerance)
+        refuse_passage(self._equations, self.states[-1], state)
+        return state
 
 
 @dataclass
@@ -217,6 +250,11 @@ class _LoadRamp:
 
     def state_text(self, mu: Array) -> str:
         return f"{100.0 * mu[0]:.4g} % of all loads at {where(self._equations, self._full)}"
+
+    def passage(self, before: State, after: State) -> str | None:
+        passage = getattr(self._equations, "passage", None)
+        ends = (replace(state, mu=self._full) for state in (before, after))
+        return None if passage is None else passage(*ends)
 
     def prescribed(self, mu: Array) -> Array:
         return self._begin + mu[0] * self._motion
