@@ -8,12 +8,21 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_log
 from morph_dslam.registration.increments import moved_pose, moved_similarity, pose_jacobian, similarity_jacobian
-from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.keyframe_adjustment import (
+    AdjustedKeyframes,
+    KeyframeAdjustment,
+    KnownPlace,
+    similarity_of_path,
+)
 from morph_dslam.registration.registration import Axis
-from morph_dslam.registration.scene import camera_from_object
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object
 from morph_dslam.registration.texture import align_patches, carry
 from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.patches import normalize_contrast
+from tests.support.bent_sheet import grid_triangles
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
+from tests.support.rendered_sequence import printed_texture
 
 WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 
@@ -100,6 +109,61 @@ def test_an_axis_of_revolution_leaves_its_turn_alone(disturbed):
     units = np.tile([1.0] * 3 + [np.linalg.norm(np.ptp(nodes, axis=0))] * 3, len(found.poses))
     along = (turn / units) @ (found.covariance / np.outer(units, units)) @ (turn / units)
     assert along < 1e-6 * np.trace(found.covariance / np.outer(units, units)) * (turn / units) @ (turn / units)
+
+
+def corner():
+    """Three square faces of a cube of 6 cm that meet in (0, 0, 0.06): nodes, triangles, texture coordinates."""
+    u, v = (axis.ravel() / 8.0 for axis in np.meshgrid(np.arange(9), np.arange(9)))
+    one = np.ones_like(u)
+    faces = [(u, v, one), (v, 0 * u, u), (0 * u, u, v)]
+    nodes = 0.06 * np.concatenate([np.column_stack(face) for face in faces])
+    triangles = np.concatenate([grid_triangles(9, 9) + 81 * k for k in range(3)])
+    coordinates = np.concatenate([np.column_stack([u, v]) * 110.0 + [120.0 * k + 20.0, 20.0] for k in range(3)])
+    return nodes, triangles, coordinates
+
+
+def seen_corner(world):
+    """Points of the map beside the faces, and views with images of them."""
+    nodes, triangles, coordinates = corner()
+    texture = normalize_contrast(printed_texture(400, 520, 3), 31)
+    rng = np.random.default_rng(4)
+    table = np.column_stack([rng.uniform(-0.15, 0.25, (300, 2)), np.zeros(300)])
+    views = []
+    for frame, pose in enumerate(cameras(6, turn=0.7)):
+        local = pose.apply(nodes)
+        drawn = rasterise(CAMERA.project(local), local[:, 2], triangles, CAMERA.height, CAMERA.width)
+        image = np.where(drawn.covered, render_textured(drawn, triangles, coordinates, texture), np.uint8(128))
+        rotation = pose.rotation @ world.rotation.T
+        in_map = RigidTransform(rotation, world.scale * pose.translation - rotation @ world.translation)
+        pixels = CAMERA.project(pose.apply(table)) + rng.normal(0.0, 0.1, (300, 2))
+        views.append(View(frame, image.astype(np.uint8), in_map, np.arange(300), pixels))
+    return MapPoints(world.apply(table), np.zeros((300, 3))), views
+
+
+def test_a_corner_has_the_size_that_was_known_before_and_no_more_exactly():
+    """Scaled about the corner where they meet, plane faces stay where they are: no image of them tells the size."""
+    nodes, triangles, _ = corner()
+    points, views = seen_corner(WORLD)
+    adjustment, centre = KeyframeAdjustment(nodes, triangles, CAMERA, points, views, None), nodes.mean(axis=0)
+    top = np.array([0.0, 0.0, 0.06])
+    larger = moved_similarity(WORLD, np.array([0.03, 0, 0, 0, 0, 0, 0]), top)
+    for place in (WORLD, larger):
+        known = KnownPlace(place, np.diag([0.02, 0.05, 0.05, 0.05, 0.02, 0.02, 0.02]) ** 2)
+        found, covariance = similarity_of_path(adjustment.adjust(place, known), place, centre)
+        assert np.log(found.scale / place.scale) == pytest.approx(0.0, abs=0.004)
+        np.testing.assert_allclose(found.apply(top), WORLD.apply(top), atol=2e-3 * WORLD.scale)
+        assert np.sqrt(covariance[0, 0]) == pytest.approx(0.02, rel=0.3)
+
+
+def test_what_was_known_before_gives_way_to_what_images_tell(disturbed):
+    """The wedge's warped faces tell its size; before, it was known to 10 %, and off by 1 %."""
+    nodes, triangles, _ = wedge()
+    points, views = disturbed
+    centre = nodes.mean(axis=0)
+    adjustment = KeyframeAdjustment(nodes, triangles, CAMERA, points, views, None)
+    larger = moved_similarity(WORLD, np.array([0.01, 0, 0, 0, 0, 0, 0]), centre)
+    found, covariance = similarity_of_path(adjustment.adjust(larger, KnownPlace(larger)), larger, centre)
+    assert abs(np.log(found.scale / WORLD.scale)) < min(0.006, 3.0 * np.sqrt(covariance[0, 0]))
 
 
 def test_nothing_to_compare_is_no_adjustment():

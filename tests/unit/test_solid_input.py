@@ -24,7 +24,7 @@ from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplace
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter
 from morph_dslam.studies.build import build, build_warnings
-from morph_dslam.studies.provenance import locking_warnings
+from morph_dslam.studies.provenance import study_warnings
 from morph_dslam.studies.study import load_study, make_study
 from tests.support.block_study import write_study
 from tests.support.meshes import SHEET
@@ -189,7 +189,7 @@ def test_a_load_that_cannot_be_carried_keeps_what_converged() -> None:
 )
 def test_elements_that_lock_are_said_of_a_study(tmp_path, changes, expected):
     """Young's modulus is a parameter there; its default counts."""
-    found = locking_warnings(load_study(write_study(tmp_path, *changes)))
+    found = study_warnings(load_study(write_study(tmp_path, *changes)))
     assert len(found) == len(expected)
     for line, part in zip(found, expected, strict=True):
         assert part in line

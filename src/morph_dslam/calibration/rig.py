@@ -199,7 +199,7 @@ def _by_intrinsics(cameras: Sequence[Calibration], sightings: Sequence[_Sighting
     centre = np.array([max(c.solution.centre_deviation) / c.solution.camera.fx for c in cameras])
     of_pair = np.column_stack([depth * np.hypot(focal, focal[0]), np.hypot(centre, centre[0])])
     of_pair[0] = 0.0
-    return of_pair
+    return np.asarray(of_pair, dtype=np.float64)
 
 
 def _board_pose(camera: Camera, view: View) -> RigidTransform:

@@ -7,7 +7,7 @@ from morph_dslam.studies.inner_structures import (
     read_inner_structure as read_inner_structure,
 )
 from morph_dslam.studies.problem import ModelMesh as ModelMesh, Snapshot as Snapshot
-from morph_dslam.studies.provenance import locking_warnings as locking_warnings
+from morph_dslam.studies.provenance import study_warnings as study_warnings
 from morph_dslam.studies.rigid import build_rigid as build_rigid
 from morph_dslam.studies.sampling import held_out_samples as held_out_samples, training_samples as training_samples
 from morph_dslam.studies.snapshots import (

@@ -5,6 +5,10 @@ So in the end each keyframe gets a pose of its own about the object, in metres: 
 agree on the mesh, and with which the map's points, which stand still beside it, agree as well. It is a bundle
 adjustment in which the object's points lie on its surface and the others are free.
 
+Images of a few plane faces do not tell the size of an object: scaled about the corner where they meet, all faces stay
+where they are. So the place that the object had before, by its edges or the map's points, counts as well, with its
+covariance, as a prior of what all poses have in common.
+
 The covariance is a sandwich (Huber & Ronchetti, Robust Statistics, 6.3): neighbouring measurements share
 their errors, and so do all pairs of views that show one patch of the surface. So the gradients are summed by
 patches, and by points, before their squares are.
@@ -17,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix, rotation_log
@@ -49,6 +54,9 @@ POINT_ITERATIONS, RIDGE = 3, 1e-6
 LEAST_DEPTH = 0.05
 #: Directions that are seen worse than this, over the best one, stay as they are.
 LEAST_SEEN = 1e-9
+#: Where nothing is known of the place before: standard deviations of the log scale, of the turn, radians, and of the
+#: shift as a share of the object's size. They hold where the images leave a direction open.
+VAGUE = 0.1
 #: Errors of all poses together are given by so many error factors: the registration's seven, and one more.
 N_FACTORS = 8
 
@@ -115,6 +123,68 @@ class _PoseTerms:
     information: Array
     gradients: Array
     sigma_px: float
+
+
+@dataclass(frozen=True)
+class KnownPlace:
+    """Where an object is by what is no image of its surface.
+
+    Attributes
+    ----------
+    place : world_from_object.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node, world; None if not known.
+    """
+
+    place: SimilarityTransform
+    covariance: Array | None = None
+
+    def information(self, size: float) -> Array:
+        """Inverse covariance (7, 7) of log scale, turn, and shift, metres, of an object of this size, in its frame."""
+        vague = np.diag([VAGUE**-2] * 4 + [(VAGUE * size) ** -2] * 3)
+        if self.covariance is None or not self.covariance.any():
+            return vague
+        back = self.place.rotation.T
+        chain = np.asarray(block_diag(1.0, back, back / self.place.scale), dtype=np.float64)
+        return np.asarray(np.linalg.inv(chain @ self.covariance @ chain.T), dtype=np.float64) + vague
+
+
+def common_motion(poses: Sequence[RigidTransform], centre: Array) -> Array:
+    """How poses' increments (6 K, 7) go with log scale, turn and shift, metres, of the object against all cameras.
+
+    Turn and shift are about the ``centre``, in the object's frame.
+    """
+    own = SimilarityTransform.identity()
+    return np.concatenate([similarity_jacobian(pose, own, centre) for pose in poses])
+
+
+class _PriorTerms:
+    """What the place before says of the poses that are adjusted.
+
+    Parameters
+    ----------
+    known : the place before.
+    views : K that are adjusted.
+    centre : (3,) mean node of the object.
+    size : of the object, metres.
+    """
+
+    def __init__(self, known: KnownPlace, views: Sequence[View], centre: Array, size: float) -> None:
+        self._poses = [camera_from_object(view, known.place) for view in views]
+        self._centre, self._known = centre, known.information(size)
+
+    def at(self, poses: Sequence[RigidTransform], motion: Array) -> tuple[Array, Array]:
+        """Factor F (7, 6 K) of the information F' F, and right-hand side (6 K,) of the poses' normal equations.
+
+        ``motion`` (6 K, 7) is the `common_motion` of the poses.
+        """
+        metric = np.asarray(block_diag(*(_metric(pose, self._centre) for pose in poses)), dtype=np.float64)
+        project = np.linalg.pinv(metric @ motion) @ metric
+        away = [
+            np.concatenate([rotation_log(pose.rotation @ own.rotation.T), pose.translation - own.translation])
+            for pose, own in zip(poses, self._poses, strict=True)
+        ]
+        factor = np.linalg.cholesky(self._known).T @ project
+        return factor, -factor.T @ (factor @ np.concatenate(away))
 
 
 class _StaticPoints:
@@ -241,13 +311,20 @@ class KeyframeAdjustment:
         self._comparison, self._axis = TextureComparison(nodes, triangles, camera), axis
         self._size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
 
-    def adjust(self, placed: SimilarityTransform) -> AdjustedKeyframes | None:
-        """Poses near those of a registration; None where too little can be compared."""
+    def adjust(self, placed: SimilarityTransform, known: KnownPlace | None = None) -> AdjustedKeyframes | None:
+        """Poses near those of a registration; None where too little can be compared.
+
+        Parameters
+        ----------
+        placed : world_from_object to begin at.
+        known : the place by what is no image of the surface; None where that is ``placed``, and hardly known.
+        """
         views = views_of(self._nodes, placed, self._all_views, self._camera, MOST_VIEWS)
         if len(views) < 2:
             return None
         poses = [camera_from_object(view, placed) for view in views]
         static = _StaticPoints(placed.inverse.apply(self._points.positions), views, self._camera)
+        before = _PriorTerms(known or KnownPlace(placed), views, self._nodes.mean(axis=0), self._size)
         images, units = [view.normalized for view in views], self._units(len(views))
         mixing = _Mixing()
         for _ in range(ITERATIONS):
@@ -255,7 +332,7 @@ class KeyframeAdjustment:
             if sum(len(pair.offsets) for pair in measured) < FEWEST * len(views):
                 return None
             on_mesh, beside = self._mesh_terms(measured, poses), static.linearise(poses)
-            step, covariance = self._solved(on_mesh, beside, poses)
+            step, covariance = self._solved(on_mesh, beside, before, poses)
             step = units * mixing.mixed(step / units)
             poses = [moved_pose(pose, part) for pose, part in zip(poses, step.reshape(-1, 6), strict=True)]
         return AdjustedKeyframes(views, poses, covariance, on_mesh.sigma_px)
@@ -295,16 +372,27 @@ class KeyframeAdjustment:
         depth = float(np.median([pose.apply(middle)[2] for pose in poses]))
         return depth / max(self._camera.fx, self._camera.fy)
 
-    def _solved(self, on_mesh: _PoseTerms, beside: _PoseTerms, poses: list[RigidTransform]) -> tuple[Array, Array]:
+    def _solved(
+        self, on_mesh: _PoseTerms, beside: _PoseTerms, before: _PriorTerms, poses: list[RigidTransform]
+    ) -> tuple[Array, Array]:
         """The step (6 K,) of all poses, and their covariance (6 K, 6 K)."""
-        gradients = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.gradients, beside.gradients])
-        right = on_mesh.gradients.sum(axis=0) + beside.gradients.sum(axis=0)
         units = self._units(len(poses))
-        information = (on_mesh.information + beside.information) * np.outer(units, units)
+        motion = common_motion(poses, self._nodes.mean(axis=0))
+        # Points that are free say nothing of what all poses have in common; what keeps their blocks invertible does.
+        basis = np.linalg.qr(motion / units[:, None])[0]
+        rest = np.eye(len(units)) - basis @ basis.T
+        static, static_gradients = rest @ (beside.information * np.outer(units, units)) @ rest, beside.gradients * units
+        static_gradients = static_gradients @ rest
+        of_prior, right = before.at(poses, motion)
+        of_prior, right = of_prior * units, right * units
+        right = right + on_mesh.gradients.sum(axis=0) * units + static_gradients.sum(axis=0)
+        information = on_mesh.information * np.outer(units, units) + static + of_prior.T @ of_prior
         inverse = _inverse(information, self._turn(poses) / units)
-        step = inverse @ (right * units)
-        half = (gradients * units) @ inverse
-        return step * units, IN_COMMON * half.T @ half * np.outer(units, units)
+        step = inverse @ right
+        half = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.gradients * units, static_gradients]) @ inverse
+        prior_half = of_prior @ inverse
+        covariance = IN_COMMON * half.T @ half + prior_half.T @ prior_half
+        return step * units, covariance * np.outer(units, units)
 
     def _units(self, count: int) -> Array:
         """What makes the increments (6 K,) of poses comparable."""

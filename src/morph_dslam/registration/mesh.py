@@ -25,7 +25,12 @@ from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.hints import NO_HINTS, Hints
 from morph_dslam.registration.icp import Surface, fit_surface, same_place
-from morph_dslam.registration.keyframe_adjustment import AdjustedKeyframes, KeyframeAdjustment, similarity_of_path
+from morph_dslam.registration.keyframe_adjustment import (
+    AdjustedKeyframes,
+    KeyframeAdjustment,
+    KnownPlace,
+    similarity_of_path,
+)
 from morph_dslam.registration.messages import (
     UNITS,
     Ambiguity,
@@ -269,11 +274,14 @@ def _by_edges(
     if aligned.rms_px > POOR_AGREEMENT_PX:
         return replace(found, unrefined=NotRefined(Unrefined.IMAGES_DIFFER, aligned.rms_px))
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
+    # As exact as the edges have it, where the images have it: what these leave open stayed there.
+    known = KnownPlace(aligned.place, best.covariance)
     adjusted = _adjusted(
         replace(found, world_from_object=aligned.place, rms_px=aligned.rms_px, shape_shown=aligned.shows_its_shape),
         adjustment,
         nodes.mean(axis=0),
         search.scale_std,
+        known,
     )
     if adjusted.keyframes is None:
         return replace(found, unrefined=_why_not_compared(comparison, search, aligned.place, views))
@@ -342,10 +350,14 @@ def _best_rivals(others: list[Rival]) -> tuple[Rival, ...]:
 
 
 def _adjusted(
-    found: MeshRegistration, adjustment: KeyframeAdjustment, mean_node: Array, scale_std: float
+    found: MeshRegistration,
+    adjustment: KeyframeAdjustment,
+    mean_node: Array,
+    scale_std: float,
+    known: KnownPlace | None = None,
 ) -> MeshRegistration:
     """The registration with keyframes placed about the object, where there is enough to compare."""
-    keyframes = adjustment.adjust(found.world_from_object)
+    keyframes = adjustment.adjust(found.world_from_object, known)
     if keyframes is None:
         return found
     placed, covariance = similarity_of_path(keyframes, found.world_from_object, mean_node, scale_std)

@@ -27,7 +27,7 @@ from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.discretisation import discretisation_errors
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import announce
-from morph_dslam.studies.provenance import locking_warnings, provenance
+from morph_dslam.studies.provenance import provenance, study_warnings
 from morph_dslam.studies.sections import ReductionSection
 from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_sections import make_mesh
@@ -122,7 +122,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
     doubts = _unstrained(snapshots) or _doubtful(model)
-    if found := [*_unresolved(chosen, snapshots), *locking_warnings(chosen), *doubts]:
+    if found := [*_unresolved(chosen, snapshots), *study_warnings(chosen), *doubts]:
         model.certificate["warnings"] = found
     save_model(output, model)
     return model

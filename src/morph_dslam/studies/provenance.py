@@ -66,10 +66,6 @@ def study_warnings(study: Study) -> list[str]:
     return [*_locking(study), *study.doubts()] if isinstance(study, BodyStudy) else []
 
 
-#: The same, by the name that callers had when it was about elements that lock alone.
-locking_warnings = study_warnings
-
-
 def _locking(study: BodyStudy) -> list[str]:
     """A sentence for each material that is nearly incompressible in displacement elements.
 

@@ -18,7 +18,7 @@ import tomlkit
 from morph_dslam import make_study
 from morph_dslam.errors import MorphError, StudioError
 from morph_dslam.extend.mechanics import constant_quantities, laws, material_catalogue
-from morph_dslam.extend.studies import SolidStudy, locking_warnings
+from morph_dslam.extend.studies import SolidStudy, study_warnings
 
 #: Characters of a study file.
 LONGEST_TEXT = 500_000
@@ -81,7 +81,7 @@ def study_state(path: Path) -> dict[str, Any]:
                 state["sets"] = sorted({*mesh.surfaces, *mesh.node_sets})
                 state["cell_sets"] = sorted(mesh.cell_sets)
                 state["problems"] = _unused(study)
-            state["warnings"] = [*locking_warnings(study), *(str(warning.message) for warning in caught)]
+            state["warnings"] = [*study_warnings(study), *(str(warning.message) for warning in caught)]
     except MorphError as error:
         state["problems"] = [str(error).removeprefix("the study: ")]
     return state
