@@ -6,8 +6,8 @@ agree on the mesh, and with which the map's points, which stand still beside it,
 adjustment in which the object's points lie on its surface and the others are free.
 
 Images of a few plane faces do not tell the size of an object: scaled about the corner where they meet, all faces stay
-where they are. So the place that the object had before, by its edges or the map's points, counts as well, with its
-covariance, as a prior of what all poses have in common.
+where they are. What images leave open stays as it was before, by the object's edges or the map's points, and has the
+covariance that it had.
 
 The covariance is a sandwich (Huber & Ronchetti, Robust Statistics, 6.3): neighbouring measurements share
 their errors, and so do all pairs of views that show one patch of the surface. So the gradients are summed by
@@ -158,33 +158,22 @@ def common_motion(poses: Sequence[RigidTransform], centre: Array) -> Array:
 
 
 class _PriorTerms:
-    """What the place before says of the poses that are adjusted.
+    """How exactly the place before tells what all poses have in common.
 
     Parameters
     ----------
     known : the place before.
-    views : K that are adjusted.
     centre : (3,) mean node of the object.
     size : of the object, metres.
     """
 
-    def __init__(self, known: KnownPlace, views: Sequence[View], centre: Array, size: float) -> None:
-        self._poses = [camera_from_object(view, known.place) for view in views]
-        self._centre, self._known = centre, known.information(size)
+    def __init__(self, known: KnownPlace, centre: Array, size: float) -> None:
+        self._centre, self._root = centre, np.linalg.cholesky(known.information(size)).T
 
-    def at(self, poses: Sequence[RigidTransform], motion: Array) -> tuple[Array, Array]:
-        """Factor F (7, 6 K) of the information F' F, and right-hand side (6 K,) of the poses' normal equations.
-
-        ``motion`` (6 K, 7) is the `common_motion` of the poses.
-        """
+    def factor(self, poses: Sequence[RigidTransform], motion: Array) -> Array:
+        """Factor F (7, 6 K) of the information F' F about the poses, whose `common_motion` (6 K, 7) is ``motion``."""
         metric = np.asarray(block_diag(*(_metric(pose, self._centre) for pose in poses)), dtype=np.float64)
-        project = np.linalg.pinv(metric @ motion) @ metric
-        away = [
-            np.concatenate([rotation_log(pose.rotation @ own.rotation.T), pose.translation - own.translation])
-            for pose, own in zip(poses, self._poses, strict=True)
-        ]
-        factor = np.linalg.cholesky(self._known).T @ project
-        return factor, -factor.T @ (factor @ np.concatenate(away))
+        return np.asarray(self._root @ np.linalg.pinv(metric @ motion) @ metric, dtype=np.float64)
 
 
 class _StaticPoints:
@@ -317,14 +306,14 @@ class KeyframeAdjustment:
         Parameters
         ----------
         placed : world_from_object to begin at.
-        known : the place by what is no image of the surface; None where that is ``placed``, and hardly known.
+        known : how exactly the place is known by what is no image of the surface; None where it hardly is.
         """
         views = views_of(self._nodes, placed, self._all_views, self._camera, MOST_VIEWS)
         if len(views) < 2:
             return None
         poses = [camera_from_object(view, placed) for view in views]
         static = _StaticPoints(placed.inverse.apply(self._points.positions), views, self._camera)
-        before = _PriorTerms(known or KnownPlace(placed), views, self._nodes.mean(axis=0), self._size)
+        before = _PriorTerms(known or KnownPlace(placed), self._nodes.mean(axis=0), self._size)
         images, units = [view.normalized for view in views], self._units(len(views))
         mixing = _Mixing()
         for _ in range(ITERATIONS):
@@ -375,21 +364,21 @@ class KeyframeAdjustment:
     def _solved(
         self, on_mesh: _PoseTerms, beside: _PoseTerms, before: _PriorTerms, poses: list[RigidTransform]
     ) -> tuple[Array, Array]:
-        """The step (6 K,) of all poses, and their covariance (6 K, 6 K)."""
-        units = self._units(len(poses))
+        """The step (6 K,) of all poses, and their covariance (6 K, 6 K).
+
+        What keeps the blocks of free points invertible holds the step where images leave it open. It is no information,
+        so the covariance has the place before in its stead.
+        """
+        units, turn = self._units(len(poses)), self._turn(poses)
+        of_mesh, static = (terms.information * np.outer(units, units) for terms in (on_mesh, beside))
+        mesh_gradients, gradients = on_mesh.gradients * units, beside.gradients * units
+        step = _inverse(of_mesh + static, turn / units) @ (mesh_gradients.sum(axis=0) + gradients.sum(axis=0))
         motion = common_motion(poses, self._nodes.mean(axis=0))
-        # Points that are free say nothing of what all poses have in common; what keeps their blocks invertible does.
         basis = np.linalg.qr(motion / units[:, None])[0]
         rest = np.eye(len(units)) - basis @ basis.T
-        static, static_gradients = rest @ (beside.information * np.outer(units, units)) @ rest, beside.gradients * units
-        static_gradients = static_gradients @ rest
-        of_prior, right = before.at(poses, motion)
-        of_prior, right = of_prior * units, right * units
-        right = right + on_mesh.gradients.sum(axis=0) * units + static_gradients.sum(axis=0)
-        information = on_mesh.information * np.outer(units, units) + static + of_prior.T @ of_prior
-        inverse = _inverse(information, self._turn(poses) / units)
-        step = inverse @ right
-        half = np.concatenate([np.sqrt(ACROSS_PATCHES) * on_mesh.gradients * units, static_gradients]) @ inverse
+        of_prior = before.factor(poses, motion) * units
+        inverse = _inverse(of_mesh + rest @ static @ rest + of_prior.T @ of_prior, turn / units)
+        half = np.concatenate([np.sqrt(ACROSS_PATCHES) * mesh_gradients, gradients @ rest]) @ inverse
         prior_half = of_prior @ inverse
         covariance = IN_COMMON * half.T @ half + prior_half.T @ prior_half
         return step * units, covariance * np.outer(units, units)
