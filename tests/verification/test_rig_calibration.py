@@ -11,7 +11,7 @@ from morph_dslam.calibration.board import Board, find_corners
 from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import CameraError
-from morph_dslam.extend.tracking import calibrate_rig
+from morph_dslam.extend.calibration import calibrate_rig
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_rig
 from morph_dslam.registration.board import BoardFile, FiducialBoard

@@ -77,7 +77,7 @@ class RigCalibration:
             apart, angle = np.linalg.norm(pose.translation), np.linalg.norm(rotation_log(pose.rotation))
             lines.append(
                 f"cam{number}: {1e3 * apart:.2f} mm from cam{number - 1} and turned by {np.degrees(angle):.2f} degrees "
-                f"(deviations {1e3 * shift:.2f} mm, {np.degrees(turn):.3f} degrees)"
+                f"(deviations from cam0: {1e3 * shift:.2f} mm, {np.degrees(turn):.3f} degrees)"
             )
         return "\n".join(lines)
 

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _run_rig(arguments: argparse.Namespace, sources: list[list[Path]]) -> None:
     """Calibrate several cameras, and print how well each is known and where it is."""
-    from morph_dslam.extend.tracking import calibrate_rig
+    from morph_dslam.extend.calibration import calibrate_rig
 
     rig = calibrate_rig(sources, _board(arguments), arguments.output, arguments.lens)
     for number, calibration in enumerate(rig.cameras):

@@ -4,6 +4,7 @@ Here are what a command-line program needs, and the registries: a new law, sourc
 file that registers it. Building blocks stand in a module for each subject:
 
 =====================  ==============================================================================
+`extend.calibration`   cameras that are fixed to each other
 `extend.geometry`      rigid and similarity transforms, rotations
 `extend.identification` constant parameters from measured points and forces
 `extend.mechanics`     meshes, hyperelastic laws, supports, loads, and what solves a `SolidProblem`

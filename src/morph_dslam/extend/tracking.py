@@ -1,6 +1,5 @@
 """Points bound to a model, and the estimator of parameters and pose that `morph_dslam.Tracker` is built on."""
 
-from morph_dslam.calibration.rig import RigCalibration as RigCalibration, calibrate_rig as calibrate_rig
 from morph_dslam.tracking.binding import (
     View as View,
     bind_pixels as bind_pixels,

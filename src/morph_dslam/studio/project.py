@@ -7,7 +7,7 @@ import json
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ FRAMES, BOARD = "frames", "board"
 LIVE, EARLIER_LANDMARKS = "live", "landmarks-before.csv"
 #: Folder of the recording of the still scene.
 SCAN = "scan"
-#: Where uploads wait until they have been looked at: hidden, so they are none of the project's files yet.
-UPLOADING = ".upload"
+#: How folders begin where uploads wait until they have been looked at: hidden, so they are no files of the project yet.
+UPLOADING = ".upload-"
 _CHOICES, _DAMAGED = "studio.json", "studio-damaged{}.json"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000
@@ -148,14 +148,8 @@ class Project:
     @contextmanager
     def uploading(self, name: str) -> Iterator[Path]:
         """Where an upload is written until it has been looked at, under the name that messages about it say."""
-        around = self.folder / UPLOADING
-        around.mkdir(exist_ok=True)
-        try:
-            with tempfile.TemporaryDirectory(dir=around) as folder:
-                yield Path(folder) / name
-        finally:
-            with suppress(OSError):  # others may be coming
-                around.rmdir()
+        with tempfile.TemporaryDirectory(prefix=UPLOADING, dir=self.folder) as folder:
+            yield Path(folder) / name
 
     @property
     def choices(self) -> dict[str, Any]:

@@ -149,7 +149,8 @@ def _keep_others_out(opened: ExitStack, project: Project) -> None:
             "terminal)"
         ) from error
     opened.callback((project.folder / _OPEN_AT).unlink, missing_ok=True)
-    shutil.rmtree(project.folder / UPLOADING, ignore_errors=True)
+    for left in project.folder.glob(f"{UPLOADING}*"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _listening(host: str, port: int) -> socket.socket:
