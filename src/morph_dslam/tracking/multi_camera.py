@@ -229,16 +229,17 @@ class RigErrors:
         common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
         """
         views = self._views(estimate, measured)
-        products = [view.systematic.products(view.estimate, view.weights) for view in views]
-        hessian = np.sum([view.chain.T @ own @ view.chain for view, own in zip(views, products, strict=True)], axis=0)
+        frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
+        both = list(zip(views, frames, strict=True))
+        hessian = np.sum([view.chain.T @ frame.hessian @ view.chain for view, frame in both], axis=0)
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
-        for view, px in zip(views, common_px, strict=True):
-            moved = view.systematic.pushed_by_model(view.estimate, view.weights, view.chain, gain, px)
+        for (view, frame), px in zip(both, common_px, strict=True):
+            moved = view.systematic.pushed_by_model(frame, view.chain, gain, px)
             covariance = covariance + moved @ moved.T
         if self._is_known:
-            pushes = [view.chain.T @ view.systematic.pushed(view.estimate, view.weights) for view in views]
+            pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
             transfer = gain @ np.sum(pushes, axis=0)
             covariance = covariance + transfer @ transfer.T
         return replace(estimate, covariance=covariance)

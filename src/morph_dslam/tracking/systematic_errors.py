@@ -78,7 +78,7 @@ class Unexplained:
 
 
 @dataclass(frozen=True)
-class _Linearization:
+class Linearization:
     """A frame's points about its estimate; all is zero for those that do not count.
 
     Attributes
@@ -220,7 +220,7 @@ class SystematicErrors:
         past_information : (d + 6, d + 6) with which earlier frames count in it; None where they do not
         keeps : whether later frames rest on it
         """
-        frame = self._linearized(estimate, weights)
+        frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
         hessian = frame.hessian + past
         if prior is not None:
@@ -248,43 +248,36 @@ class SystematicErrors:
             self._by_reference, self._by_model = by_reference, by_model
         return replace(estimate, covariance=covariance)
 
-    def _learn_reference(self, frame: _Linearization, left: Array) -> None:
+    def _learn_reference(self, frame: Linearization, left: Array) -> None:
         """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""
         both = np.concatenate([frame.residuals[:, :, None], left], axis=2)
         shown, *expected = np.diag(self._common.in_common(both, self._common.n_pairs(frame.usable)))
         self._misfit.learn(float(shown), float(sum(expected)))
 
-    def products(self, estimate: Estimate, weights: Array) -> Array:
-        """J' W J (d + 6, d + 6): how points of these ``weights`` (p,) determine the estimate."""
-        return self._linearized(estimate, weights).hessian
-
-    def pushed(self, estimate: Estimate, weights: Array) -> Array:
-        """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters the estimate."""
+    def pushed(self, frame: Linearization, state: State) -> Array:
+        """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters a frame's estimate."""
         assert self._moved is not None
-        frame = self._linearized(estimate, weights)
-        return frame.products(self._warped(estimate.state, self._moved))
+        return frame.products(self._warped(state, self._moved))
 
-    def pushed_by_model(self, estimate: Estimate, weights: Array, chain: Array, gain: Array, common_px: float) -> Array:
+    def pushed_by_model(self, frame: Linearization, chain: Array, gain: Array, common_px: float) -> Array:
         """How an estimate from several cameras moves (n, c) by what the model is off in this one.
 
         Parameters
         ----------
-        estimate : in this camera's frame, with the residuals of its points
-        weights : (p,) of the points, zero for those that do not support it
+        frame : what this camera measured.
         chain : (d + 6, n) from the common unknowns to this camera's
         gain : (n, n) H^-1 of all cameras together
         common_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals
         """
-        frame = self._linearized(estimate, weights)
         gradients = self._common.gradients(frame.weighted_jacobian @ chain)
         share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain)
         return np.asarray(gain @ (common_px / np.sqrt(share) * gradients.T), dtype=np.float64)
 
-    def _linearized(self, estimate: Estimate, weights: Array) -> _Linearization:
+    def linearized(self, estimate: Estimate, weights: Array) -> Linearization:
         """The frame of an estimate whose points had these ``weights`` (p,)."""
         _, jacobian = self._project(estimate.state)
         residuals, huber = estimate.residuals[: len(weights)], self._estimator.options.huber_px
-        return _Linearization(*_counting(jacobian, np.ascontiguousarray(residuals), weights, huber))
+        return Linearization(*_counting(jacobian, np.ascontiguousarray(residuals), weights, huber))
 
     def _project(self, state: State) -> tuple[Array, Array]:
         points, pose = self._points, state.camera_from_object
@@ -301,7 +294,7 @@ class SystematicErrors:
 
 @njit(cache=True, nogil=True)
 def _counting(jacobian, residuals, weights, huber):
-    """What `_Linearization` holds, of all points' Jacobian (p, 2, n), residuals (p, 2) and weights (p,)."""
+    """What `Linearization` holds, of all points' Jacobian (p, 2, n), residuals (p, 2) and weights (p,)."""
     usable = np.zeros(len(weights), np.bool_)
     seen, left, weighted = np.zeros_like(jacobian), np.zeros_like(residuals), np.zeros_like(jacobian)
     for j in range(len(weights)):
