@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -182,12 +183,19 @@ def calibrate(
     found = collect_views([Path(source) for source in sources], board, ignored=picture)
     calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board, picture)
     if output is not None and picture is not None:
-        try:
+        with writing():
             save_camera(Path(output), calibration.solution.camera)
             plot_calibration(picture, calibration.solution)
-        except OSError as error:
-            raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
     return calibration
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """Say which file of a calibration cannot be written (CameraError)."""
+    try:
+        yield
+    except OSError as error:
+        raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
 
 
 def check_output(output: Path) -> Path:

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
 from morph_dslam.calibration.board import CalibrationBoard
-from morph_dslam.calibration.calibrate import Calibration, check_output, plot_calibration
+from morph_dslam.calibration.calibrate import Calibration, check_output, plot_calibration, writing
 from morph_dslam.calibration.solve import HARMLESS, OUTLIER_RATIO, solve_intrinsics
 from morph_dslam.calibration.views import View, best_views, find_views, sampling_step, select_by_coverage
 from morph_dslam.camera import Camera, LensModel
@@ -122,14 +122,12 @@ def calibrate_rig(
         seen.append(_by_number(_with_shape(found.views, cameras[0].solution.shape)))
     rig = _solve(cameras, seen)
     if output is not None:
-        try:
-            lenses = [calibration.solution.camera for calibration in cameras]
+        lenses = [calibration.solution.camera for calibration in cameras]
+        with writing():
             save_rig(Path(output), list(zip(lenses, rig.camera_from_first, strict=True)))
             for calibration in cameras:
                 assert calibration.picture is not None
                 plot_calibration(calibration.picture, calibration.solution)
-        except OSError as error:
-            raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
     return rig
 
 
