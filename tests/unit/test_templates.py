@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import fourier_shift
 
 from morph_dslam.slam.templates import Templates, image_pyramid, is_small
 from morph_dslam.tracking.patches import follow
@@ -30,7 +31,7 @@ def plane_points(pixels):
     return DEPTH * rays
 
 
-def found(texture, image, pixels, pose, guesses, levels):
+def found(texture, image, pixels, pose, guesses, levels, reach=np.inf):
     """Where points seen at ``pixels`` from the origin are in the image of another pose, and how alike they look."""
     templates, ids, rows = Templates(INTRINSICS), np.arange(len(pixels)), np.zeros(len(pixels), dtype=np.int64)
     keyframes = np.eye(4)[None], rows
@@ -38,7 +39,7 @@ def found(texture, image, pixels, pose, guesses, levels):
     assert outdated.all()
     templates.make(ids, pixels, image_pyramid(texture))
     assert not templates.outdated(ids, rows, pose, keyframes, plane_points(pixels), pixels).any()
-    return templates.align(ids, image_pyramid(image), guesses, levels)
+    return templates.align(ids, image_pyramid(image), guesses, levels, reach)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 30.0)])
@@ -54,6 +55,21 @@ def test_a_shift_is_found_whatever_the_light(texture, pixels, gain, offset):
         expected, ok = follow(texture, image, pixels, pixels)
         assert ok.all()
         assert np.abs(places - expected).max() < 0.06
+
+
+def test_a_part_of_a_pixel_is_found_to_a_fiftieth(texture, pixels):
+    shift = np.array([0.44, -0.81])
+    moved = fourier_shift(np.fft.fft2(texture.astype(float)), shift[::-1])
+    image = np.clip(np.rint(np.fft.ifft2(moved).real), 0, 255).astype(np.uint8)
+    places, _ = found(texture, image, pixels, np.eye(4), pixels.copy(), 0)
+    assert np.median(np.linalg.norm(places - pixels - shift, axis=1)) < 0.02
+
+
+def test_points_are_looked_for_no_farther_than_they_may_be(texture, pixels):
+    moved = cv2.warpAffine(texture, np.array([[1.0, 0.0, 3.0], [0.0, 1.0, 0.0]]), (640, 480))
+    for reach, expected in ((6.0, 1.0), (2.0, -1.0)):
+        _, likeness = found(texture, moved, pixels, np.eye(4), pixels.copy(), 0, reach)
+        assert np.abs(np.median(likeness) - expected) < 0.01
 
 
 @pytest.mark.parametrize(

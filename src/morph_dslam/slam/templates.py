@@ -29,7 +29,9 @@ N_LEVELS = LEVELS + 2
 #: Pixels around each level of a pyramid: half a window about a point at the border, its slopes, and interpolation.
 MARGIN = FLOW_WINDOW // 2 + 3
 #: Steps shorter than this end the search on the image itself and on coarser levels, pixels there; steps at most.
-LAST_STEP, LAST_COARSE_STEP, MOST_STEPS = 0.02, 0.1, 20
+LAST_STEP, LAST_COARSE_STEP, MOST_STEPS = 0.05, 0.3, 20
+#: Steps shorter than this are near enough to the end that each shows which share of the way it goes; within bounds.
+NEAR_STEP, LEAST_SHARE, MOST_SHARE = 0.3, 0.25, 1.5
 #: Mean square slope, in the direction in which it is least, below which a patch has no place.
 LEAST_SLOPE = 0.1
 #: Patches that are turned by less and scaled by less, along either axis, are followed as they are.
@@ -38,7 +40,14 @@ MOST_TURN, MOST_STRETCH = math.radians(14.0), 1.25
 REUSE = 0.5
 
 _SIDE, _FRAMED = FLOW_WINDOW, FLOW_WINDOW + 2
+#: A patch lies in one row, line after line of its frame, so that a loop over all its pixels is one loop of many
+#: pixels at once. What belongs to the frame counts nothing; as much is added as makes the length a multiple of 16.
+_SPAN = -(-_SIDE * _FRAMED // 16) * 16
+#: Bytes of a patch: the pixel at the lower right of the last one is read, too.
+_ROOM = _SPAN + 2 * _FRAMED + 2
 _F32 = np.float32
+#: Which pixels of the span are inside the frame.
+_INSIDE = ((np.arange(_SPAN) % _FRAMED < _SIDE) & (np.arange(_SPAN) < _SIDE * _FRAMED)).astype(_F32)
 
 
 def image_pyramid(normalized: Image) -> Pyramid:
@@ -142,7 +151,7 @@ def _copy_patch(level, x, y, patch):
     left, up = _F32(1.0) - right, _F32(1.0) - down
     for row in range(_FRAMED):
         above, below = level[y0 + row, x0 : x0 + _FRAMED + 1], level[y0 + row + 1, x0 : x0 + _FRAMED + 1]
-        line = patch[row]
+        line = patch[row * _FRAMED : (row + 1) * _FRAMED]
         for column in range(_FRAMED):
             first = left * _F32(above[column]) + right * _F32(above[column + 1])
             second = left * _F32(below[column]) + right * _F32(below[column + 1])
@@ -159,7 +168,7 @@ def _warp_patch(level, x, y, change, patch):
     x, y = _F32(x), _F32(y)
     for row in range(_FRAMED):
         below = _F32(row) - middle
-        line = patch[row]
+        line = patch[row * _FRAMED : (row + 1) * _FRAMED]
         for column in range(_FRAMED):
             right = _F32(column) - middle
             u, v = x + a * right + b * below, y + c * right + d * below
@@ -173,7 +182,7 @@ def _warp_patch(level, x, y, change, patch):
 
 @njit(cache=True, nogil=True)
 def _cut_out(pyramid, ids, pixels, changes, patches):
-    """Make the patches (levels, side, side) of points from the pyramid of their keyframe."""
+    """Make the patches (levels, room) of points from the pyramid of their keyframe."""
     for i in range(len(ids)):
         change = changes[ids[i]]
         unwarped = _is_identity(change)
@@ -187,73 +196,110 @@ def _cut_out(pyramid, ids, pixels, changes, patches):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _prepare(patch, inner, across, along):
+def _prepare(patch, greys, across, along):
     """The inner part of a framed patch, its slopes by Scharr's operator, and the sums of their products.
 
     What an offset and a gain of the brightness explain is taken out of the slopes: those that are orthogonal to both
     give the motion that least squares with both free give.
     """
     near, far = _F32(10.0 / 32.0), _F32(3.0 / 32.0)
+    for p in range(_SPAN):
+        inside, here, below = _INSIDE[p], p + _FRAMED, p + 2 * _FRAMED
+        falling = _F32(patch[below + 2]) - _F32(patch[p])
+        rising = _F32(patch[p + 2]) - _F32(patch[below])
+        beside, over = _F32(patch[here + 2]) - _F32(patch[here]), _F32(patch[below + 1]) - _F32(patch[p + 1])
+        across[p] = inside * (far * (falling + rising) + near * beside)
+        along[p] = inside * (far * (falling - rising) + near * over)
+        greys[p] = inside * (_F32(patch[here + 1]) - _F32(NEUTRAL))
     t = tt = x = y = xt = yt = _F32(0.0)
-    for row in range(_SIDE):
-        above, here, below = patch[row], patch[row + 1], patch[row + 2]
-        to_inner, to_across, to_along = inner[row], across[row], along[row]
-        for column in range(_SIDE):
-            corners_x = _F32(above[column + 2]) + _F32(below[column + 2]) - _F32(above[column]) - _F32(below[column])
-            corners_y = _F32(below[column]) + _F32(below[column + 2]) - _F32(above[column]) - _F32(above[column + 2])
-            a = far * corners_x + near * (_F32(here[column + 2]) - _F32(here[column]))
-            b = far * corners_y + near * (_F32(below[column + 1]) - _F32(above[column + 1]))
-            grey = _F32(here[column + 1])
-            to_inner[column], to_across[column], to_along[column] = grey, a, b
-            grey -= _F32(NEUTRAL)
-            t += grey
-            tt += grey * grey
-            x += a
-            y += b
-            xt += a * grey
-            yt += b * grey
+    for p in range(_SPAN):
+        grey, a, b = greys[p], across[p], along[p]
+        t += grey
+        tt += grey * grey
+        x += a
+        y += b
+        xt += a * grey
+        yt += b * grey
     count = _F32(_SIDE * _SIDE)
     mean_t, mean_x, mean_y = t / count, x / count, y / count
     square = max(tt - t * mean_t, _F32(1.0))
     gain_x, gain_y = (xt - x * mean_t) / square, (yt - y * mean_t) / square
+    offset_x, offset_y = mean_x - gain_x * mean_t, mean_y - gain_y * mean_t
+    for p in range(_SPAN):
+        across[p] -= _INSIDE[p] * offset_x + gain_x * greys[p]
+        along[p] -= _INSIDE[p] * offset_y + gain_y * greys[p]
     xx = xy = yy = _F32(0.0)
-    for row in range(_SIDE):
-        greys, to_across, to_along = inner[row], across[row], along[row]
-        for column in range(_SIDE):
-            grey = greys[column] - _F32(NEUTRAL) - mean_t
-            a = to_across[column] - mean_x - gain_x * grey
-            b = to_along[column] - mean_y - gain_y * grey
-            to_across[column], to_along[column] = a, b
-            xx += a * a
-            xy += a * b
-            yy += b * b
+    for p in range(_SPAN):
+        a, b = across[p], along[p]
+        xx += a * a
+        xy += a * b
+        yy += b * b
     return xx, xy, yy
 
 
+@njit(cache=True, nogil=True)
+def _copy_seen(level, column, row, seen):
+    """Copy the pixels that a patch is compared with, its first one between this pixel and the next."""
+    for i in range(_SIDE + 1):
+        pixels, start = level[row + i, column : column + _SIDE + 1], i * _FRAMED
+        for j in range(_SIDE + 1):
+            seen[start + j] = pixels[j]
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _difference(level, x, y, inner, across, along, line):
-    """Sums of the slopes of a patch times what the image differs from it, its first pixel at (x, y)."""
-    x0, y0 = int(x), int(y)
-    right, down = _F32(x - x0), _F32(y - y0)
+def _difference(seen, right, down, greys, across, along):
+    """Sums of the slopes of a patch times what the image differs from it, this part of a pixel to the right and down.
+
+    The slopes are orthogonal to a constant, so that it makes no difference that `NEUTRAL` is taken from the greys.
+    """
     left, up = _F32(1.0) - right, _F32(1.0) - down
-    pixels = level[y0, x0 : x0 + _SIDE + 1]
-    for column in range(_SIDE):
-        line[column] = left * _F32(pixels[column]) + right * _F32(pixels[column + 1])
     by_x, by_y = _F32(0.0), _F32(0.0)
-    for row in range(_SIDE):
-        pixels = level[y0 + row + 1, x0 : x0 + _SIDE + 1]
-        template, slope_x, slope_y = inner[row], across[row], along[row]
-        for column in range(_SIDE):
-            below = left * _F32(pixels[column]) + right * _F32(pixels[column + 1])
-            differs = up * line[column] + down * below - template[column]
-            line[column] = below
-            by_x += differs * slope_x[column]
-            by_y += differs * slope_y[column]
+    for p in range(_SPAN):
+        above = left * _F32(seen[p]) + right * _F32(seen[p + 1])
+        below = left * _F32(seen[p + _FRAMED]) + right * _F32(seen[p + _FRAMED + 1])
+        differs = up * above + down * below - greys[p]
+        by_x += differs * across[p]
+        by_y += differs * along[p]
     return by_x, by_y
 
 
+@njit(cache=True, nogil=True)
+def _approach(level, x, y, xx, xy, yy, greys, across, along, last_step, reach, seen):
+    """Where in an image a prepared patch is, from a point (x, y) on, and whether it stays in reach.
+
+    With the slopes of the patch in place of those of the image each step goes a certain share of the way that is left.
+    What a step leaves of the next one tells the share; then the next one goes the whole way (Aitken's extrapolation).
+    """
+    determinant = float(xx) * yy - float(xy) * xy
+    first_x, first_y, half = x, y, _SIDE // 2 - MARGIN
+    last_x, last_y = level.shape[1] - 2.0 * MARGIN - 1.0, level.shape[0] - 2.0 * MARGIN - 1.0
+    before_x = before_y = moved_x = moved_y = moved = 0.0
+    column = row = -1
+    for _ in range(MOST_STEPS):
+        if not (0.0 <= x <= last_x and 0.0 <= y <= last_y and max(abs(x - first_x), abs(y - first_y)) <= reach):
+            return x, y, False
+        left, top = x - half, y - half
+        if int(left) != column or int(top) != row:
+            column, row = int(left), int(top)
+            _copy_seen(level, column, row, seen)
+        by_x, by_y = _difference(seen, _F32(left - column), _F32(top - row), greys, across, along)
+        step_x = (xy * by_y - yy * by_x) / determinant
+        step_y = (xy * by_x - xx * by_y) / determinant
+        share = 1.0
+        if 0.0 < moved < NEAR_STEP * NEAR_STEP:
+            share = ((before_x - step_x) * moved_x + (before_y - step_y) * moved_y) / moved
+            share = min(max(share, LEAST_SHARE), MOST_SHARE)
+        before_x, before_y, moved_x, moved_y = step_x, step_y, step_x / share, step_y / share
+        moved = moved_x * moved_x + moved_y * moved_y
+        x += moved_x
+        y += moved_y
+        if step_x * step_x + step_y * step_y < last_step * last_step:
+            break
+    return x, y, True
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _likeness(level, x, y, inner):
+def _likeness(level, x, y, greys):
     """Correlation of the middle of a patch with the image about a point (x, y) of it."""
     first, size = _SIDE // 2 - PATCH_HALF, 2 * PATCH_HALF + 1
     x, y = x - PATCH_HALF, y - PATCH_HALF
@@ -263,9 +309,10 @@ def _likeness(level, x, y, inner):
     sum_a = sum_b = aa = bb = ab = _F32(0.0)
     for row in range(size):
         pixels, next_pixels = level[y0 + row, x0 : x0 + size + 1], level[y0 + row + 1, x0 : x0 + size + 1]
-        template = inner[first + row, first : first + size]
+        start = (first + row) * _FRAMED + first
+        template = greys[start : start + size]
         for column in range(size):
-            a = template[column] - _F32(NEUTRAL)
+            a = template[column]
             above = left * _F32(pixels[column]) + right * _F32(pixels[column + 1])
             below = left * _F32(next_pixels[column]) + right * _F32(next_pixels[column + 1])
             b = up * above + down * below - _F32(NEUTRAL)
@@ -280,51 +327,40 @@ def _likeness(level, x, y, inner):
 
 
 @njit(cache=True, nogil=True)
-def _align(patches, ids, pyramid, first, pixels, likeness):
+def _align(patches, ids, pyramid, first, reach, pixels, likeness):
     """Move each point to where its patch is in an image; ``likeness`` is -1 where it is nowhere.
 
     Parameters
     ----------
-    patches : (p, levels, side, side) of all points.
+    patches : (p, levels, room) of all points.
     ids : (n,) the points to look for.
     pyramid : of the image.
     first : level to begin on.
+    reach : pixels along either axis that a point may go on a level.
     pixels : (n, 2) where to begin; where they are.
     likeness : (n,) correlation of the patch there.
     """
-    shape = (_SIDE, _SIDE)
-    inner, across, along = np.empty(shape, _F32), np.empty(shape, _F32), np.empty(shape, _F32)
-    line, half = np.empty(_SIDE, _F32), _SIDE // 2
+    greys, across, along = np.empty(_SPAN, _F32), np.empty(_SPAN, _F32), np.empty(_SPAN, _F32)
+    seen, lowest = np.zeros(_ROOM, np.uint8), LEAST_SLOPE * _SIDE * _SIDE
+    height, width = pyramid[0].shape[0] - 2 * MARGIN, pyramid[0].shape[1] - 2 * MARGIN
     for i in range(len(ids)):
         x, y = pixels[i, 0], pixels[i, 1]
         found = False
         for number in range(first, -1, -1):
-            level, size = pyramid[number], float(1 << number)
-            xx, xy, yy = _prepare(patches[ids[i], number], inner, across, along)
-            mean = 0.5 * (xx + yy)
-            found = mean - math.hypot(0.5 * (xx - yy), xy) > LEAST_SLOPE * _SIDE * _SIDE
-            if not found:
-                continue
-            determinant, least = float(xx) * yy - float(xy) * xy, LAST_STEP if number == 0 else LAST_COARSE_STEP
-            u, v = x / size, y / size
-            last_u, last_v = level.shape[1] - 2.0 * MARGIN - 1.0, level.shape[0] - 2.0 * MARGIN - 1.0
-            for _ in range(MOST_STEPS):
-                found = u >= 0.0 and v >= 0.0 and u <= last_u and v <= last_v
+            xx, xy, yy = _prepare(patches[ids[i], number], greys, across, along)
+            found = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy) > lowest
+            if found:
+                size, last = float(1 << number), LAST_STEP if number == 0 else LAST_COARSE_STEP
+                x, y, found = _approach(
+                    pyramid[number], x / size, y / size, xx, xy, yy, greys, across, along, last, reach / size, seen
+                )
+                x, y = x * size, y * size
                 if not found:
                     break
-                by_x, by_y = _difference(level, u - half + MARGIN, v - half + MARGIN, inner, across, along, line)
-                step_x = (xy * by_y - yy * by_x) / determinant
-                step_y = (xy * by_x - xx * by_y) / determinant
-                u += step_x
-                v += step_y
-                if step_x * step_x + step_y * step_y < least * least:
-                    break
-            x, y = u * size, v * size
         pixels[i, 0], pixels[i, 1], likeness[i] = x, y, -1.0
-        height, width = pyramid[0].shape[0] - 2 * MARGIN, pyramid[0].shape[1] - 2 * MARGIN
         inside = min(x, y) >= PATCH_HALF and x < width - 1 - PATCH_HALF and y < height - 1 - PATCH_HALF
         if found and inside:
-            likeness[i] = _likeness(pyramid[0], x + MARGIN, y + MARGIN, inner)
+            likeness[i] = _likeness(pyramid[0], x + MARGIN, y + MARGIN, greys)
 
 
 class Templates:
@@ -332,7 +368,7 @@ class Templates:
 
     def __init__(self, intrinsics: Array) -> None:
         self._intrinsics = intrinsics
-        self._patches = np.empty((0, N_LEVELS, _FRAMED, _FRAMED), dtype=np.uint8)
+        self._patches = np.empty((0, N_LEVELS, _ROOM), dtype=np.uint8)
         self._views, self._changes = np.empty(0, dtype=np.int64), np.empty((0, 2, 2))
 
     def outdated(
@@ -366,7 +402,9 @@ class Templates:
         """Make the patches of points (n,), which are at ``pixels`` (n, 2) of a keyframe."""
         _cut_out(keyframe, ids, pixels, self._changes, self._patches)
 
-    def align(self, ids: Indices, image: Pyramid, guesses: Array, levels: int) -> tuple[Array, Array]:
+    def align(
+        self, ids: Indices, image: Pyramid, guesses: Array, levels: int, reach: float = np.inf
+    ) -> tuple[Array, Array]:
         """Where points (n,) are in an image.
 
         Parameters
@@ -375,6 +413,7 @@ class Templates:
         image : its pyramid.
         guesses : (n, 2) pixels to begin at.
         levels : above the image itself, on which to begin.
+        reach : pixels along either axis, per level, that a point may go from where it begins.
 
         Returns
         -------
@@ -382,7 +421,7 @@ class Templates:
         likeness : (n,) correlation of the patches there; -1 where a point was not found.
         """
         pixels, likeness = guesses.copy(), np.empty(len(ids))
-        _align(self._patches, ids, image, levels, pixels, likeness)
+        _align(self._patches, ids, image, levels, reach, pixels, likeness)
         return pixels, likeness
 
     def _make_room(self, n_points: int) -> None:

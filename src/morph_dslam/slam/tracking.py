@@ -99,8 +99,8 @@ MOST_PYRAMIDS = 8
 SEARCH_POINTS, SEARCH_KEYFRAMES = 80, 3
 #: In a frozen map lost points are looked for while fewer than this are followed, and so many are missing.
 ENOUGH_POINTS, WORTH_A_SEARCH = 340, 20
-#: How far from its predicted pixel a lost point may be found.
-SEARCH_RADIUS_PX = 5.0
+#: How far from its predicted pixel a lost point may be found, and how far the search may go.
+SEARCH_RADIUS_PX, SEARCH_REACH_PX = 5.0, 16.0
 #: Weight of the newest frame in the usual error.
 USUAL_RATE = 0.1
 
@@ -310,7 +310,7 @@ class Tracker:
             self._views.choose(guesses.ids)
         return self._look_for(image, guesses, pose, levels)
 
-    def _look_for(self, image: Pyramid, guesses: Followed, pose: Array, levels: int) -> Followed:
+    def _look_for(self, image: Pyramid, guesses: Followed, pose: Array, levels: int, reach: float = np.inf) -> Followed:
         guesses = guesses[inside(guesses.pixels, shape_of(image), 0.0)]
         ids = guesses.ids
         if not len(ids):
@@ -322,7 +322,7 @@ class Tracker:
         for number in np.unique(views[outdated]).tolist():
             rows = outdated & (views == number)
             self._templates.make(ids[rows], pixels[rows], self._pyramid_of(number))
-        found, likeness = self._templates.align(ids, image, guesses.pixels, levels)
+        found, likeness = self._templates.align(ids, image, guesses.pixels, levels, reach)
         return Followed(ids, found)[likeness > LEAST_CORRELATION]
 
     def _keyframe_poses(self, views: Indices) -> tuple[Array, Indices]:
@@ -391,7 +391,8 @@ class Tracker:
         wanted = wanted[self._chosen(wanted.ids, most)]
         # Where they would be seen is as far from there, the other way, as what is seen from the middle row's instant.
         moved = self._at_middle_row(wanted, pose).pixels - wanted.pixels
-        found = self._look_for(image, Followed(wanted.ids, wanted.pixels - moved), pose, NEAR_LEVELS)
+        guesses = Followed(wanted.ids, wanted.pixels - moved)
+        found = self._look_for(image, guesses, pose, NEAR_LEVELS, SEARCH_REACH_PX)
         pixels = self._at_middle_row(found, pose).pixels
         errors = reprojection_errors(pose, self._map.positions[found.ids], pixels, self._intrinsics)
         self._map.n_expected[wanted.ids[~self._among(found.ids)[wanted.ids]]] += 1
