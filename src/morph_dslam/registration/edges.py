@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -50,50 +51,90 @@ SHOWN = 0.8
 FEWEST = 30
 
 
+class Slopes(NamedTuple):
+    """Change of grey in an image.
+
+    Attributes
+    ----------
+    x, y : (h, w) in a pixel to the right, and downwards.
+    steep : (h, w) whether it is at least `LEAST_EDGE` in a pixel or the next ones to the right and below: between these
+        four it is less everywhere if it is less in all.
+    """
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    steep: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, image: NDArray[np.uint8]) -> Slopes:
+        """Those of an image (h, w), a little smoothed."""
+        smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+        x, y = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, *way) / 8.0, np.float32) for way in ((1, 0), (0, 1)))
+        steep = (x * x + y * y >= LEAST_EDGE**2).astype(np.uint8)
+        return cls(x, y, cv2.dilate(steep, np.ones((2, 2), np.uint8), anchor=(0, 0)) > 0)
+
+
 @njit(cache=True, nogil=True)
-def find_edges(slope_x, slope_y, pixels, normals, reach, least):
+def _strength(slopes, x, y, nx, ny):
+    """Change of grey along a direction (nx, ny) at a place in an image; 0 if it is not steepest about there."""
+    height, width = slopes.x.shape
+    column, row = int(np.floor(x)), int(np.floor(y))
+    if column < 1 or row < 1 or column >= width - 2 or row >= height - 2:
+        return 0.0
+    a, b = x - column, y - row
+    gx = (1 - b) * ((1 - a) * slopes.x[row, column] + a * slopes.x[row, column + 1]) + b * (
+        (1 - a) * slopes.x[row + 1, column] + a * slopes.x[row + 1, column + 1]
+    )
+    gy = (1 - b) * ((1 - a) * slopes.y[row, column] + a * slopes.y[row, column + 1]) + b * (
+        (1 - a) * slopes.y[row + 1, column] + a * slopes.y[row + 1, column + 1]
+    )
+    along = abs(gx * nx + gy * ny)
+    return along if along > PARALLEL * np.sqrt(gx * gx + gy * gy) else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _may_be_edge(slopes, x, y):
+    """Whether a place is so far inside of an image that it may be an edge, and some pixel around it is steep."""
+    height, width = slopes.x.shape
+    if not (x >= 1.0 and y >= 1.0 and x < width - 2.0 and y < height - 2.0):
+        return False
+    return slopes.steep[int(y), int(x)]
+
+
+@njit(cache=True, nogil=True)
+def find_edges(slopes, pixels, normals, reach):
     """The strongest edge (p,) near each of some points, in pixels along the normal; NaN where there is none.
 
     Parameters
     ----------
-    slope_x : (h, w) change of grey to the right in a pixel.
-    slope_y : (h, w) downwards.
+    slopes : `Slopes` of the image.
     pixels : (p, 2) where to search.
     normals : (p, 2) along which.
     reach : pixels to either side; nearer edges are preferred.
-    least : change of grey of an edge.
     """
-    height, width = slope_x.shape
     n = int(2 * reach) * 2 + 1
-    offsets, strengths = np.full(len(pixels), np.nan), np.zeros(n)
+    offsets, first = np.full(len(pixels), np.nan), -0.5 * int(2 * reach)
     for p in range(len(pixels)):
-        best, nx, ny = 0.0, normals[p, 0], normals[p, 1]
-        for k in range(n):
-            away = 0.5 * k - int(2 * reach) * 0.5
-            x, y = pixels[p, 0] + away * nx, pixels[p, 1] + away * ny
-            column, row = int(np.floor(x)), int(np.floor(y))
-            strengths[k] = 0.0
-            if column < 1 or row < 1 or column >= width - 2 or row >= height - 2:
-                continue
-            a, b = x - column, y - row
-            gx = (1 - b) * ((1 - a) * slope_x[row, column] + a * slope_x[row, column + 1]) + b * (
-                (1 - a) * slope_x[row + 1, column] + a * slope_x[row + 1, column + 1]
-            )
-            gy = (1 - b) * ((1 - a) * slope_y[row, column] + a * slope_y[row, column + 1]) + b * (
-                (1 - a) * slope_y[row + 1, column] + a * slope_y[row + 1, column + 1]
-            )
-            along = abs(gx * nx + gy * ny)
-            if along > PARALLEL * np.sqrt(gx * gx + gy * gy):
-                strengths[k] = along
+        best, u, v, nx, ny = 0.0, pixels[p, 0], pixels[p, 1], normals[p, 0], normals[p, 1]
+        known, before, here, after = -1, 0.0, 0.0, 0.0
         for k in range(1, n - 1):
-            if strengths[k] < least or strengths[k] < strengths[k - 1] or strengths[k] <= strengths[k + 1]:
+            away = first + 0.5 * k
+            if not _may_be_edge(slopes, u + away * nx, v + away * ny):
                 continue
-            away = 0.5 * k - int(2 * reach) * 0.5
-            weight = min(strengths[k], 20.0) * np.exp(-2.0 * (away / reach) ** 2)
+            # The place before was looked at already where it may have been an edge, too.
+            if known == k - 1:
+                before, here = here, after
+            else:
+                before = _strength(slopes, u + (away - 0.5) * nx, v + (away - 0.5) * ny, nx, ny)
+                here = _strength(slopes, u + away * nx, v + away * ny, nx, ny)
+            after = _strength(slopes, u + (away + 0.5) * nx, v + (away + 0.5) * ny, nx, ny)
+            known = k
+            if here < LEAST_EDGE or here < before or here <= after:
+                continue
+            weight = min(here, 20.0) * np.exp(-2.0 * (away / reach) ** 2)
             if weight > best:
                 best = weight
-                bend = strengths[k - 1] - 2.0 * strengths[k] + strengths[k + 1]
-                offsets[p] = away + 0.25 * (strengths[k - 1] - strengths[k + 1]) / min(bend, -1e-9)
+                offsets[p] = away + 0.25 * (before - after) / min(before - 2.0 * here + after, -1e-9)
     return offsets
 
 
@@ -147,21 +188,21 @@ def edge_equations(points, turned_about, normals, smooth, offsets, reach, intrin
 
 
 @njit(cache=True, nogil=True)
-def view_equations(edges, rotation, translation, intrinsics, width, height, slope_x, slope_y, reach, inward_px):
+def view_equations(edges, rotation, translation, intrinsics, width, height, slopes, reach, inward_px):
     """Normal equations (7, 7) of a pose's step by a view's edges (`edge_equations`); zero if it shows too few.
 
     Parameters
     ----------
     edges : `EdgePoints` of the object.
     rotation, translation, intrinsics, width, height : of the view, as of `seen_from`.
-    slope_x, slope_y : (h, w) change of grey in a pixel to the right and downwards.
+    slopes : `Slopes` of the image.
     reach : pixels to search to either side.
     inward_px : as of `edge_equations`.
     """
     rows, points, pixels, normals, _ = see_edges(edges, rotation, translation, intrinsics, width, height)
     if len(points) < FEWEST:
         return np.zeros((7, 7))
-    offsets = find_edges(slope_x, slope_y, pixels, normals, reach, LEAST_EDGE)
+    offsets = find_edges(slopes, pixels, normals, reach)
     if np.isfinite(offsets).sum() < FEWEST:
         return np.zeros((7, 7))
     return edge_equations(points, translation, normals, ~edges.sharp[rows], offsets, reach, intrinsics, inward_px)
@@ -265,11 +306,9 @@ class EdgeImages:
         self.views, self.camera, self._scale_std = list(views), camera, scale_std
 
     @cached_property
-    def slopes(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Change of grey in a pixel to the right and downwards, (h, w) each, of every view."""
-        smooth = [cv2.GaussianBlur(view.normalized, (0, 0), 1.0).astype(np.float32) for view in self.views]
-        pairs = [(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1)) for image in smooth]
-        return [(np.asarray(x / 8.0, np.float32), np.asarray(y / 8.0, np.float32)) for x, y in pairs]
+    def slopes(self) -> list[Slopes]:
+        """Of every view."""
+        return [Slopes.of(view.normalized) for view in self.views]
 
     def refine(
         self,
@@ -328,7 +367,7 @@ class EdgeImages:
         inward_px = INWARD_PX * np.sqrt(len(self.views))
         for view, slopes in zip(self.views, self.slopes, strict=True):
             pose = camera_from_object(view, place)
-            own = view_equations(edges.arrays, *seen_from(pose, self.camera), *slopes, float(reach), inward_px)
+            own = view_equations(edges.arrays, *seen_from(pose, self.camera), slopes, float(reach), inward_px)
             by_place = similarity_jacobian(pose, place, centre)
             matrix += by_place.T @ own[:6, :6] @ by_place
             right += by_place.T @ own[:6, 6]
@@ -341,19 +380,14 @@ class EdgeImages:
             seen = edges.visible(camera_from_object(view, place), self.camera)
             if len(seen.points) < FEWEST:
                 continue
-            shift = _own_shift(
-                find_edges(slopes[0], slopes[1], seen.pixels, seen.normals, 4.0, LEAST_EDGE), seen.normals
-            )
+            shift = _own_shift(find_edges(slopes, seen.pixels, seen.normals, 4.0), seen.normals)
             pixels = seen.pixels + shift
             aside = [side * away for away in ASIDE_PX for side in (-1.0, 1.0)]
 
             def near(
-                away: float,
-                pixels: Array = pixels,
-                normals: Array = seen.normals,
-                slopes: tuple[NDArray[np.float32], NDArray[np.float32]] = slopes,
+                away: float, pixels: Array = pixels, normals: Array = seen.normals, slopes: Slopes = slopes
             ) -> Array:
-                found = find_edges(*slopes, pixels + away * normals, normals, NEAR_PX, LEAST_EDGE)
+                found = find_edges(slopes, pixels + away * normals, normals, NEAR_PX)
                 return np.isfinite(found)
 
             on.append(near(0.0))
