@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Results in a notebook
 #
-# This notebook reads a run folder and plots what it holds. It works with any run; here a small one is made first.
+# This notebook reads a run folder, as `morph track` writes it, and plots what it holds. Name yours in place of `run`.
 
 # %%
 from pathlib import Path

@@ -6,6 +6,7 @@ The command line prints the message alone and exits with status 2. Everything el
 from __future__ import annotations
 
 from enum import StrEnum
+from os import PathLike
 from typing import Any
 
 
@@ -30,6 +31,17 @@ def check_kind(value: object, kind: type[Any] | tuple[type[Any], ...], what: str
     if not isinstance(value, kind):
         shown = repr(value) if isinstance(value, str | int | float | bool | None) else f"of type {type(value).__name__}"
         raise ArgumentError(f"{what} is {shown}: give {instead}")
+
+
+def how_to_install(extra: str) -> str:
+    """What to do where the packages of an extra of this package are missing; it is on no index."""
+    return f"run `pip install '.[{extra}]'` in the project's folder"
+
+
+def refusal(error: OSError, path: PathLike[str] | None = None) -> str:
+    """What the system says of a file that it refuses; ``path`` is named where the system names none."""
+    name = error.filename or path
+    return f"{error.strerror or error}" if name is None else f"{name}: {error.strerror or error}"
 
 
 class StudyError(MorphError):

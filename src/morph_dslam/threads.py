@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import wraps
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 import cv2
@@ -37,12 +38,29 @@ def one_thread_for_algebra(function: Callable[P, R]) -> Callable[P, R]:
     return alone
 
 
+#: Where Linux says what share of the processors a container may use: microseconds of work in so many, or "max".
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+
+
+def usable_cores() -> int:
+    """How many cores this process may use: a cluster's job or a container has often fewer than its machine.
+
+    Threads beyond these wait for each other, and solves then take many times as long.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        work, period = _QUOTA.read_text().split()
+    except (OSError, ValueError):
+        return cores
+    return cores if work == "max" else max(1, min(cores, round(int(work) / int(period))))
+
+
 def on_all_cores(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """What a function gives for each item, in their order, by as many threads as there are cores.
+    """What a function gives for each item, in their order, by as many threads as `usable_cores`.
 
     It saves time where most of the work is compiled code that needs no interpreter.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(usable_cores()) as threads:
         return list(threads.map(function, items))
 
 

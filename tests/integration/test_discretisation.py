@@ -78,6 +78,12 @@ def test_the_estimate_is_how_far_beam_theory_is_from_locking_hexahedra(
     assert missing.max() > 0.2 * np.abs(true).max()
     assert entry["errors"]["displacement"]["mean_mm"] == pytest.approx(1e3 * missing.mean(), rel=0.03)
     assert entry["errors"]["displacement"]["max_mm"] == pytest.approx(1e3 * missing.max(), rel=0.03)
+    # A push of which the locked bar bends as far as the true one: all of its nodes are on the surface.
+    locked, size = np.linalg.norm(found, axis=1), np.sqrt(np.mean(np.square(true), axis=1))
+    more = np.einsum("sn,sn->s", found, np.array(true)) / locked**2 - 1.0
+    pushes = [state[0] for state in entry["coordinates"]]
+    assert entry["parameters"]["errors"]["push"] == pytest.approx(more * pushes, rel=0.04)
+    assert entry["parameters"]["displacement_rms_mm"] == pytest.approx(1e3 * size, rel=0.03)
     # The reaction is the load, whatever the elements; its moment too.
     assert entry["errors"]["reaction_force_z_min"]["relative_l2"] < (0.01 if iterative else 1e-6)
 

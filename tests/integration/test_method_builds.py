@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 
+import ngsolve
 import numpy as np
 import pytest
 
 from morph_dslam import build, make_study
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import SolverError, StudyError
+from morph_dslam.mechanics.solvers.continuation import PathError
 from morph_dslam.model import load_model
+from morph_dslam.reduction import galerkin
+from morph_dslam.studies.build import build_warnings
 from morph_dslam.studies.defaults import resolve_defaults
 from tests.support.block_study import STUDY, bent_block, write_study
 
@@ -43,6 +48,56 @@ def test_methods_reduce_the_same_solutions(tmp_path) -> None:
     assert len(list((tmp_path / "block.morph.snapshots").glob("*.npz"))) == 22
     assert max(errors["galerkin"], errors["pod"]) < 1e-3
     assert errors["sparse_pgd"] < 0.05
+
+
+def lose_reduced_solutions(monkeypatch) -> None:
+    """Let no reduced solution be found, as where the projected equations have a limit point that the full ones lack."""
+
+    def stalled(equations, mu, start):
+        raise SolverError("stalls")
+
+    def lost(equations, start, target):
+        raise PathError("stalls", [start])
+
+    monkeypatch.setattr(galerkin.ReducedSolver, "_corrected", lambda *_: None)
+    monkeypatch.setattr(galerkin, "solve", stalled)
+    monkeypatch.setattr(galerkin, "advance", lost)
+
+
+def test_a_default_method_without_reduced_solutions_gives_way_to_pod(tmp_path, monkeypatch) -> None:
+    lose_reduced_solutions(monkeypatch)
+    solver = {"threads": 1, "workers": 1}
+    study = BLOCK | {"solver": solver, "sampling": {"scheme": "sobol", "training": 12, "held_out": 4, "refined": 0}}
+    build(make_study(study | {"reduction": {}}), tmp_path / "block.morph")
+    model = load_model(tmp_path / "block.morph")
+    reduction = model.certificate["reduction"]
+    assert reduction["method"] == "pod"
+    (warning,) = reduction["warnings"]
+    place = r"bend = [-\d.]+ deg, squash = [-\d.]+ mm"
+    assert re.search(rf'"galerkin" failed, "pod" .* solved at {place}, nor beyond {place}', warning)
+    assert warning in build_warnings(model.certificate)
+    # The face that is led: turned by 20 degrees about y through its middle at z = 60 mm, and pushed in by 2 mm.
+    end, turn = model.nodes[:, 2] > 0.06 - 1e-9, np.radians(20.0)
+    x, y, _ = model.nodes[end].T
+    led = np.column_stack([0.01 + np.cos(turn) * (x - 0.01), y, 0.058 - np.sin(turn) * (x - 0.01)])
+    moved = model.nodes[end] + model.at({"bend": "20 deg", "squash": "2 mm"}).displacement()[end]
+    assert np.abs(moved - led).max() < 1e-4
+    with pytest.raises(StudyError, match=r'"galerkin" failed: .* Use reduction\.method = "pod"'):
+        build(make_study(study | {"reduction": {"method": "galerkin"}}), tmp_path / "block.morph")
+
+
+def test_a_build_reduces_in_its_own_threads_where_all_samples_are_found(tmp_path) -> None:
+    solver = {"threads": 1, "workers": 1}
+    sampling = {"scheme": "sobol", "training": 8, "held_out": 4, "refined": 0}
+    study = BLOCK | {"solver": solver, "sampling": sampling, "reduction": {"method": "pod"}}
+    build(make_study(study), tmp_path / "block.morph")
+    try:
+        ngsolve.SetNumThreads(2)
+        build(make_study(study), tmp_path / "block.morph")
+        with ngsolve.TaskManager():
+            assert ngsolve.GetNumThreads() == 1
+    finally:
+        ngsolve.SetNumThreads(1)
 
 
 def test_reactions_of_a_model_balance_its_loads(tmp_path) -> None:

@@ -48,5 +48,7 @@ def test_the_other_samples_do_what_the_page_says(page):
     folder, names, _ = page
     assert (folder / "drawn.png").is_file()
     assert all(result.tracked for result in names["results"].values())
+    assert [each.frame.index for each in names["found"]] == [0, 1, 2]
+    assert all(result.tracked for each in names["found"] for result in each.results.values())
     assert sorted(path.name for path in (folder / "states").glob("*.vtu"))[-1].endswith("_0004.vtu")
     np.testing.assert_allclose(names["state"].parameters, [0.020, 0.3, 0.0])

@@ -229,7 +229,7 @@ def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
 
 
 @pytest.mark.parametrize("printed", [lambda board: board, turned_tags], ids=["OpenCV's tags", "AprilTag's"])
-def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed, refused):
+def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed, refused, capsys):
     board = printed(load_board(written(tmp_path, GRID)))
     world = SimilarityTransform(3.7, rotation_exp(np.array([0.4, -0.9, 1.3])), np.array([0.5, -1.2, 2.0]))
     rigid_map = RigidMap()
@@ -247,6 +247,10 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed,
     files = [str(tmp_path / name) for name in ("map.h5", "sheet.morph", "camera.yaml", "board.toml", "place")]
     arguments = ["register", files[0], "--model", files[1], "--camera", files[2], "--board", files[3]]
     assert main([*arguments, "-o", files[4]]) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    said = dict(pair.split("=") for pair in line.split())
+    assert float(said["map_units_per_metre"]) == pytest.approx(3.7, rel=2e-3)
+    assert list(said)[1:] == ["rms_px", "place_std_mm", "angle_std_deg", "ambiguous"]
     placed = load_registration(tmp_path / "place" / "registration.json", scene.model)
     assert placed.facts["map_units_per_metre"] == pytest.approx(3.7, rel=2e-3)
     turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()

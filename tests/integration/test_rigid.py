@@ -91,7 +91,7 @@ def test_command_line_tracks_draws_and_writes_what_a_rigid_object_has(folder, co
     capsys.readouterr()
     for option, message in (
         (["--show", "stress"], "holds no stress to show"),
-        (["--per-sequence", "lever"], "'lever' cannot be one over the sequence: the model's parameters are none"),
+        (["--per-sequence", "lever"], "'lever' cannot be a per-sequence parameter: the model's parameters are none"),
         (["--section", "x=20"], "it has no inside to show in a section"),
     ):
         assert main([*command, *option, "-o", str(folder / "other")]) == 2

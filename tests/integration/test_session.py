@@ -91,6 +91,16 @@ def test_a_session_without_files_keeps_what_passes_before_an_object_from_spoilin
     assert max(errors["behind"]) < 1.0e-3
 
 
+def test_two_objects_are_tracked_from_the_first_frame_of_a_session(model, films):
+    """Without a reference, as the page on programs of one's own has them: the first frame is the registrations'."""
+    trackers = {name: Tracker(model, CAMERA, Registration(model, state)) for name, state in states(0.0).items()}
+    recording = [Frame(number, time, frame(model, films, time)) for number, time in enumerate(TIMES[:3])]
+    for tracked in md.Session(trackers, recording):
+        for name, result in tracked.results.items():
+            assert result.tracked, (name, result.reason)
+            assert mean_error(model, result.estimate.state, states(tracked.frame.timestamp)[name]) < 0.3e-3
+
+
 def test_occluded_points_are_known_to_be_occluded(model, films):
     """By themselves, points behind the other sheet count as visible, and have to be thrown out by looks."""
     aware, unaware = MultiObjectTracker(new_trackers(model, films)), new_trackers(model, films)["behind"]

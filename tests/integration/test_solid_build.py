@@ -8,6 +8,7 @@ import tomllib
 from dataclasses import replace
 
 import h5py
+import meshio
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from morph_dslam import build, load_study, make_study
 from morph_dslam.cli import app as cli
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model, save_model
 from morph_dslam.studies.snapshots import load_snapshot
 from tests.support.block_study import sliding
@@ -371,3 +373,62 @@ def test_python_states_the_same_study(built):
     mu = np.array([0.1, 0.002])
     kept = load_model(built / "block.morph").positions(mu)
     assert model.positions(mu) == pytest.approx(kept, abs=1e-8)
+
+
+LAYERS = """
+name = "two layers"
+[mesh]
+file = "layers.inp"
+unit = "mm"
+[materials.soft]
+law = "linear_elastic"
+on = "soft"
+young = "60 kPa"
+poisson = 0.0
+[materials.stiff]
+law = "linear_elastic"
+on = "stiff"
+young = "600 kPa"
+poisson = 0.0
+[[supports]]
+kind = "fixed"
+on = "root"
+[[supports]]
+kind = "displacement"
+on = "end"
+x = "stretch"
+[parameters.stretch]
+range = ["0 mm", "4 mm"]
+[solver]
+threads = 1
+workers = 1
+[sampling]
+scheme = "sobol"
+training = 8
+held_out = 4
+refined = 0
+"""
+
+
+def test_every_element_block_of_a_file_is_in_the_model_with_its_material(tmp_path):
+    """Two layers of 40 x 10 x 5 mm, an ELSET each, stretched side by side: stress is modulus times stretch in each."""
+    mesh = block((0.04, 0.01, 0.01), (4, 2, 4), "hex8")
+    (cells,) = (part.connectivity for part in mesh.blocks)
+    height, x = mesh.nodes[cells].mean(axis=1)[:, 2], mesh.nodes[:, 0]
+    lines = ["*NODE", *(f"{k}, {a}, {b}, {c}" for k, (a, b, c) in enumerate(1e3 * mesh.nodes, start=1))]
+    for name, chosen in (("soft", height < 5e-3), ("stiff", height > 5e-3)):
+        lines.append(f"*ELEMENT, TYPE=C3D8, ELSET={name}")
+        lines += [", ".join(map(str, [k + 1, *(cells[k] + 1)])) for k in np.flatnonzero(chosen)]
+    for name, place in (("root", 0.0), ("end", 0.04)):
+        lines += [f"*NSET, NSET={name}", *(f"{k + 1}," for k in np.flatnonzero(np.isclose(x, place)))]
+    (tmp_path / "layers.inp").write_text("\n".join(lines))
+    (tmp_path / "study.toml").write_text(LAYERS)
+    model = build(tmp_path / "study.toml", tmp_path / "layers.morph")
+    places = np.array([[0.02, 0.004, 0.001], [0.02, 0.004, 0.009]])
+    stress = model.at({"stretch": "4 mm"}).stress(points=model.points(places))
+    assert stress[:, 0] == pytest.approx([6e3, 6e4], rel=1e-6)
+    out = tmp_path / "out"
+    assert cli.main(["export", str(tmp_path / "layers.morph"), "-o", str(out), "--format", "vtu"]) == 0
+    written = meshio.read(out / "layers_0000.vtu")
+    volumes = np.prod(np.ptp(written.points[written.cells_dict["hexahedron"]], axis=1), axis=1)
+    assert volumes.sum() == pytest.approx(4e-6, rel=1e-6)

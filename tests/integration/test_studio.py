@@ -266,7 +266,8 @@ def test_without_the_extra_there_is_one_message():
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert done.stderr.strip() == (
-        "morph: morph studio needs starlette, which is not installed: pip install 'morph-dslam[studio]'"
+        "morph: morph studio needs starlette, which is not installed: run `pip install '.[studio]'` in "
+        "the project's folder"
     )
 
 

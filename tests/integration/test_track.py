@@ -21,6 +21,7 @@ from morph_dslam.io.folders import only_writer
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.documents import code_words
 from tests.support.rendered_sequence import SheetFilm, sheet_state, write_landmarks, write_recording
 
 TIMES = np.linspace(0.0, 0.24, 7)
@@ -113,6 +114,7 @@ def test_table_and_summary_are_in_display_units(finished):
     assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary, default=str))
     assert (summary["n_tracked"], summary["n_lost"]) == (6, 1)
     assert any("1 of 7 frames were lost" in flag for flag in summary["flags"])
+    assert summary.keys() - code_words("run-folder") == set()
 
 
 def test_video_and_plots_are_there(finished):
@@ -309,16 +311,38 @@ def test_random_walk_and_start_are_named(inputs, tmp_path):
     np.testing.assert_allclose(twists, [sheet_state(time).parameters[2] for time in TIMES[:3]], atol=0.01)
 
 
+def test_a_named_point_is_followed(inputs, tmp_path):
+    """The middle of the sheet's right end, in millimetres, whose motion is known."""
+    files = [
+        "--model",
+        inputs / "sheet.morph",
+        "--camera",
+        inputs / "camera.yaml",
+        "--landmarks",
+        inputs / FILES["landmarks"],
+    ]
+    more = ["--range", "20-23", "--point", "end=210,0,0", "--no-video", "-o", tmp_path / "run"]
+    assert main([str(word) for word in ("track", inputs / "frames", *files, *more)]) == 0
+    model = load_run(tmp_path / "run").model
+    node = int(np.linalg.norm(model.nodes - [0.21, 0.0, 0.0], axis=1).argmin())
+    rows = list(csv.DictReader((tmp_path / "run" / "frames.csv").read_text().splitlines()))
+    for row, time in zip(rows, TIMES, strict=False):
+        truth = 1e3 * (model.positions(sheet_state(time).parameters) - model.nodes)[node]
+        found = [float(row[f"displacement_end_{axis}_mm"]) for axis in "xyz"]
+        np.testing.assert_allclose(found, truth, atol=0.5)
+    assert (tmp_path / "run" / "plots" / "points.png").is_file()
+
+
 def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_path):
     summary = track(
         options(inputs, tmp_path / "run", last=23, tracker=TrackerOptions(per_sequence=("twist",)), video=False)
     )
-    assert summary["temporal_prior"] == "one over the sequence, from all frames so far: twist; none on the others"
+    assert summary["temporal_prior"] == "per-sequence parameters, from all frames so far: twist; none on the others"
     (twist,) = summary["one_over_the_sequence"]
     low, high = twist["interval_95"]
     assert (twist["name"], twist["unit"]) == ("twist", "deg")
     assert low < twist["value"] < high
     assert finished[1]["temporal_prior"] == "none"
     assert finished[1]["one_over_the_sequence"] == []
-    with pytest.raises(TrackingError, match="'bend' cannot be one over the sequence"):
+    with pytest.raises(TrackingError, match="'bend' cannot be a per-sequence parameter"):
         track(options(inputs, tmp_path / "other", tracker=TrackerOptions(per_sequence=("bend",))))

@@ -1,5 +1,7 @@
 """The whole online chain on rendered sequences whose truth is known."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import DepthNotUsed, RejectionReason
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.tracker import Tracker
+from morph_dslam.tracking.tracker_inputs import check_tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_depth, sheet_state
 from tests.support.staged_scenes import aside
@@ -181,14 +185,72 @@ def test_arguments_of_another_kind_are_named(model, arguments, named):
         Tracker(*(known.get(one, one) if isinstance(one, str) else one for one in arguments))
 
 
+def test_a_registration_of_another_object_is_refused(model):
+    known = Registration(model, sheet_state(0.0))
+    finer, other = bent_sheet_model(45, 31), replace(model, nodes=1.01 * model.nodes)
+    fewer = replace(model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], name="twirl")))
+    for wrong, said in (
+        (finer, r"its mesh has 1333 nodes, and the model's 1395"),
+        (other, rf"nodes of its mesh are up to {10.0 * np.hypot(0.21, 0.1485):.3g} mm from"),
+        (fewer, "its parameters are arch, skew, twist, and the model's arch, skew, twirl"),
+    ):
+        with pytest.raises(ArgumentError, match=said):
+            Tracker(wrong, CAMERA, known)
+        with pytest.raises(ArgumentError, match=said):
+            RigTracker(wrong, [], known, references=[])
+    # The same mesh from a file; and an angle that was left open, which the registration's model alone has.
+    again = replace(model, name="again", nodes=model.nodes.astype(np.float32).astype(np.float64))
+    check_tracker(again, known, None)
+    turning = replace(model, parameters=(*model.parameters, replace(model.parameters[-1], name="turn")))
+    check_tracker(model, replace(known, model=turning, per_sequence=("turn",)), None)
+    with pytest.raises(ArgumentError, match="arch, skew, twist, turn, and the model's arch, skew, twist;"):
+        check_tracker(model, replace(known, model=turning), None)
+
+
+def test_before_its_first_frame_a_tracker_is_where_the_registration_has_it(model, film):
+    """Or where it is told to go on from: the reference view is of the registration all the same."""
+    first, other = sheet_state(0.0), sheet_state(0.02)
+    tracker = Tracker(model, CAMERA, Registration(model, first))
+    assert tracker.state is first
+    tracker.continue_from(other)
+    assert tracker.state is other
+    result = tracker.track(film.frame(first))
+    assert result.tracked, result.reason
+    assert mean_error(model, result.estimate.state, first) < 0.3e-3
+    np.testing.assert_allclose(tracker.reference.pixels, CAMERA.project(tracker.reference.points.in_camera(first)))
+
+
 def test_a_pose_is_held_fixed_by_a_map(model):
     with pytest.raises(TrackingError, match="held fixed by a map"):
         Tracker(model, CAMERA, Registration(model, sheet_state(0.0)), TrackerOptions(pose="fixed"))
 
 
-def test_a_session_takes_trackers_by_name(model):
+def test_a_session_takes_trackers_by_name_frames_and_a_list_of_sinks(model):
+    tracker = started_alike(model)
     with pytest.raises(ArgumentError, match="by its name"):
-        Session(started_alike(model), [])
+        Session(tracker, [])
+    with pytest.raises(ArgumentError, match=r"source is None: give frames"):
+        Session({"sheet": tracker}, None)
+    for sinks in (print, [print, "video"]):
+        with pytest.raises(ArgumentError, match=r"a list of functions .*\[results.append\]"):
+            Session({"sheet": tracker}, [], sinks)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (lambda image: Frame(3, 0.1, image), "the session's source gives frame 3 after frame 3: number frames"),
+        (lambda image: Frame(1, 0.1, image), "gives frame 1 after frame 3"),
+        (lambda image: (Frame(4, 0.1, image), Frame(3, 0.1, image)), "gives frame 3 after frame 3"),
+        (lambda image: image, "an object of type ndarray after frame 3: give md.Frame objects"),
+    ],
+)
+def test_a_session_takes_frames_in_their_order(model, film, second, message):
+    """The frame before the wrong one is handed out."""
+    image, results = film.frame(sheet_state(0.01)), []
+    with pytest.raises(SourceError, match=message):
+        Session({"sheet": started_alike(model)}, [Frame(3, 0.0, image), second(image)], [results.append]).run()
+    assert [tracked.frame.index for tracked in results] == [3]
 
 
 def test_same_frames_give_the_same_states(model):

@@ -23,6 +23,7 @@ MU = np.array([2000.0, 0.25, 0.5])
     [
         ("3 MPa", "stress", 3e6),
         ("-3 MPa", "stress", -3e6),
+        ("1.5 bar + 200 mbar - load", "pressure", 1.68e5),
         (0.45, "ratio", 0.45),
         ("0.45", "ratio", 0.45),
         ("load", "stress", 2000.0),

@@ -14,10 +14,19 @@ from morph_dslam.cli import app as cli
 from morph_dslam.cli.arguments import frame_range
 from morph_dslam.errors import StreamError, StudyError
 from morph_dslam.model import save_model
+from morph_dslam.units import FACTORS
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.documents import commands
 
 #: Figures of a run that are printed at its end.
 COUNTS = ("n_tracked", "n_frames", "n_hidden", "n_lost", "n_skipped", "median_ms", "p95_ms")
+
+
+def test_coordinates_are_in_the_units_of_studies():
+    taken = {name: [a.choices for a in parser._actions if a.dest == "unit"] for name, parser in commands().items()}
+    assert [name for name, choices in taken.items() if choices] == ["build", "info", "inner"]
+    for (choices,) in filter(None, taken.values()):
+        assert set(choices) == set(FACTORS["length"])
 
 
 @pytest.mark.parametrize("command", ["track", "live"])

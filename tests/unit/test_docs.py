@@ -10,9 +10,10 @@ import pytest
 from morph_dslam.model import SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.tensor_functions import TuckerFunctions
+from morph_dslam.studies.rigid import build_rigid
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PROJECT, code_words, commands, options, samples
-from tests.support.function_formats import FORMATS
+from tests.support.function_formats import FORMATS, OTHERS, SMOOTH
 from tests.support.small_models import block_model
 
 PAGES = [
@@ -62,6 +63,25 @@ def test_the_model_file_can_be_read_with_the_documented_program(tmp_path, reader
     positions = reader["deformed_positions"](path, mu)
     np.testing.assert_allclose(positions, model.positions(mu), atol=1e-8)
     np.testing.assert_allclose(positions, load_model(path).positions(mu), atol=1e-12)
+
+
+def test_the_programs_read_a_rigid_object(tmp_path):
+    """It has no parameters, and is where it was."""
+    corners, faces = ("0 0 0", "20 0 0", "0 20 0", "0 0 20"), ("1 3 2", "1 2 4", "1 4 3", "2 3 4")
+    lines = [*(f"v {corner}" for corner in corners), *(f"f {face}" for face in faces)]
+    (tmp_path / "block.obj").write_text("\n".join(lines) + "\n")
+    model = build_rigid(tmp_path / "block.obj", "mm", tmp_path / "block.morph")
+    for program in documented_readers():
+        with h5py.File(tmp_path / "block.morph") as file:
+            np.testing.assert_array_equal(program["field"](file, "displacement", []), np.zeros((len(model.nodes), 3)))
+
+
+@pytest.mark.parametrize(("number", "bases"), [(0, SMOOTH), (1, OTHERS)])
+def test_the_programs_refuse_functions_that_they_do_not_know(tmp_path, number, bases):
+    """They would take them for others, and be millimetres off without a word."""
+    save_model(tmp_path / "block.morph", block_model("tucker", bases))
+    with h5py.File(tmp_path / "block.morph") as file, pytest.raises(AssertionError):
+        documented_readers()[number]["field"](file, "displacement", [0.3, 0.7, 1.9])
 
 
 @pytest.mark.parametrize("form", FORMATS)

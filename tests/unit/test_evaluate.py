@@ -8,7 +8,8 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam.cli.app import main
-from morph_dslam.errors import EvaluationError
+from morph_dslam.errors import ArgumentError, EvaluationError
+from morph_dslam.evaluation.run_folder import remarks
 from morph_dslam.extend.reports import PointTruth
 from morph_dslam.extend.slam import Trajectory
 from morph_dslam.geometry import RigidTransform
@@ -37,7 +38,7 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
     assert lines[-1] == (
         "mean_mm=5.000 median_mm=5.000 p95_mm=5.000 tracked=5/6 median_ms=9.00 p95_ms=9.00 rigid_mm=0.000"
     )
-    assert any("not tracked" in line and "[12]" in line for line in lines)
+    assert "note: truth frames that were not tracked and so not compared: 12" in lines
     figures = json.loads((run / "evaluation.json").read_text())
     assert figures["mean_mm"] == pytest.approx(5.0, abs=1e-3)
     assert figures["truth_frames_not_tracked"] == [12]
@@ -51,6 +52,22 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
     assert page.index("n recovered") < page.index("9.9")
     assert page.count("data:image/png;base64,") == 2
     assert not re.search(r'(src|href)="(http|/)', page)  # self-contained
+
+
+def test_many_frames_that_cannot_be_compared_are_counted():
+    figures = {"truth_frames_not_tracked": list(range(5, 30)), "truth_frames_outside_the_run": [40, 3]}
+    assert remarks(figures | {"points_not_bound": [], "n_points_bound_at_outline": 0}) == [
+        "truth frames that were not tracked and so not compared: 25 frames from 5 to 29",
+        "truth frames outside the run: 3 and 40",
+    ]
+
+
+def test_the_frame_that_binds_is_named_where_nobody_chose_it(run_and_truth, capsys):
+    run, truth = run_and_truth
+    assert main(["evaluate", str(run), "--points", str(truth)]) == 0
+    said = capsys.readouterr().out
+    assert "note: points are bound in frame 10;" in said
+    assert said.splitlines()[-1].startswith("mean_mm=5.000 ")
 
 
 @pytest.fixture
@@ -73,6 +90,15 @@ def test_results_in_memory_are_compared_with_points(results):
     assert figures["mean_mm"] == pytest.approx(5.0, abs=1e-3)
     assert (figures["n_frames_tracked"], figures["truth_frames_not_tracked"]) == (5, [12])
     assert figures["median_ms"] == pytest.approx(7.0)
+
+
+def test_results_that_make_no_run_are_refused(results):
+    with pytest.raises(ArgumentError, match=r"results is of type list: give the result of each frame by its number"):
+        md.Run.of(CAMERA, list(results.values()))
+    with pytest.raises(ArgumentError, match=r"camera is 'camera\.yaml'"):
+        md.Run.of("camera.yaml", results)
+    with pytest.raises(EvaluationError, match="give that of at least one frame"):
+        md.Run.of(CAMERA, {})
 
 
 def test_results_in_memory_are_compared_with_depth(results):

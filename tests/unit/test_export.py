@@ -286,6 +286,25 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("titles", "slide"),
+    [
+        ("slide [cm]", 0.005),
+        ("slide_m", 0.5),
+        ("slide [um]", 0.5e-6),
+        ("slide_mm,slide_std_m,slide_at_bound", 0.5e-3),
+        ("slide_rms,slide [mm]", 1.5e-3),
+        ("slide_m,slide_mm", 1.5e-3),  # "time_ms" of a tracked run beside the parameter "time"
+    ],
+)
+def test_a_path_may_have_another_unit_of_the_quantity(titles, slide, tmp_path):
+    (tmp_path / "path.csv").write_text(f"stretch_1,{titles}\n0.1,0.5,1.5,2.5\n")
+    model = stretched_block_model()
+    model = replace(model, parameters=(model.parameters[0], replace(model.parameters[1], lower=0.0, upper=1.0)))
+    found = StateChoice(path=tmp_path / "path.csv").states(model)
+    np.testing.assert_allclose(found, [[0.1, slide]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
     ("choice", "message"),
     [
         ({"vary": ["bend=0:1:3"]}, "no parameter 'bend'; it has stretch, slide"),
@@ -307,6 +326,13 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
         ({"path": ("a,b\n1,2\n",)}, r"no column of a parameter; name the columns 'stretch \[1\]', 'slide"),
         ({"path": ("slide_mm,slide [mm]\n1,2\n",)}, r"columns 'slide_mm' and 'slide \[mm\]' both hold 'slide'"),
         ({"path": ("slide_mm,slide_mm\n1,2\n",)}, "columns 'slide_mm' and 'slide_mm' both hold 'slide'"),
+        ({"path": ("slide [mm],slide [cm]\n1,2\n",)}, r"columns 'slide \[mm\]' and 'slide \[cm\]' both hold 'slide'"),
+        ({"path": ("slide [mm],stretch [mm]\n1,0\n",)}, r"'stretch \[mm\]' has no unit of 'stretch': name it 'stretch"),
+        ({"path": ("slide [mm],stretch\n1,0\n",)}, "'stretch' has no unit of 'stretch'"),
+        ({"path": ("slide_N,stretch_1\n1,0\n",)}, r"'slide_N' has no unit .* name it 'slide \[mm\]'.*\(m, cm, mm"),
+        ({"path": ("slide [furlong],stretch_1\n1,0\n",)}, r"'slide \[furlong\]' has no unit of 'slide'"),
+        ({"path": ("slide [cm]\n2\n",)}, "line 2: 20 is outside the range of slide, -10 to 10 mm"),
+        ({"path": ("slide [cm]\nmany\n",)}, "'many' is not a value of slide: write a number in cm"),
         ({"path": ("slide_mm\n1\nmany\n",)}, r"line 3: 'many' is not a value of slide"),
         ({"path": ("slide_mm\n1\n12\n",)}, r"line 3: 12 is outside the range of slide"),
         ({"path": ("slide_mm,frame\n,1\n",)}, "holds 0 states"),

@@ -139,7 +139,7 @@ def test_a_bounded_field_is_that_of_the_nearest_state(field):
         np.testing.assert_array_equal(one, other)
     assert field.inside([1.4, 0.3, -0.2]).tolist() == [False, True, False]
     assert field.inside([1.0, 0.0, 2.0]).all()
-    with pytest.raises(ValueError, match="wild"):
+    with pytest.raises(ParameterError, match="wild"):
         field.value([0.0, 0.0, 0.0], outside="wild")
 
 

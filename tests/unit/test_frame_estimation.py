@@ -113,7 +113,7 @@ def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"per_sequence": ("bend",)}, "'bend' cannot be one over the sequence: the model's parameters are arch"),
+        ({"per_sequence": ("bend",)}, "'bend' cannot be a per-sequence parameter: the model's parameters are arch"),
         ({"random_walk": (("bend", 1.0),)}, "'bend' cannot walk"),
         ({"random_walk": (("skew", 1.0),), "per_sequence": ("skew",)}, "leave out one of both"),
         ({"random_walk": (("skew", 0.0),)}, "must be a positive number"),
@@ -145,7 +145,7 @@ def test_facts_name_what_is_used_and_nothing_by_default():
     )
     facts = temporal_facts(PARAMETERS, options)
     assert facts["temporal_prior"] == (
-        "one over the sequence, from all frames so far: skew; random walk, standard deviation of the change "
+        "per-sequence parameters, from all frames so far: skew; random walk, standard deviation of the change "
         "from frame to frame: twist by 0.5 deg; none on the others"
     )
     assert facts["start_of_each_frame"] == "the state that the last two lead to at constant velocity"

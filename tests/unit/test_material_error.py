@@ -123,6 +123,21 @@ def test_of_many_frames_a_message_gives_the_range(tracked):
         material_error(tracked[0], many, 5000)
 
 
+def test_points_are_bound_in_the_first_frame_tracked_and_measured_by_default(tmp_path):
+    """The run loses its first frame, and no point is measured or seen in the two frames then."""
+    model = write_run(tmp_path / "run", ["lost", *["tracked"] * 5])
+    truth = exact_truth(model)
+    truth["pixels"][1] = np.nan
+    truth["visible"] = np.ones(truth["pixels"].shape[:2], dtype=bool)
+    truth["visible"][2] = False
+    error = material_error(load_run(tmp_path / "run"), saved(tmp_path / "truth.npz", truth))
+    assert error.binding.frame == 13
+    assert error.distances.max() < 1e-7
+    truth["visible"][1:] = False
+    with pytest.raises(EvaluationError, match=r"tracked none of the frames in which the truth has pixels \(10\)"):
+        material_error(load_run(tmp_path / "run"), saved(tmp_path / "truth.npz", truth))
+
+
 @pytest.mark.parametrize(
     ("bind_frame", "change", "message"),
     [

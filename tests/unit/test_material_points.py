@@ -1,5 +1,7 @@
 """Points of a model by their positions, fields there, and states that a model has."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,20 @@ def test_a_point_outside_is_named_with_its_distance():
             model.points(wrong)
 
 
+def test_points_of_another_mesh_are_refused():
+    """The same mesh, reduced anew and rounded by its file, takes them; one with as many nodes elsewhere does not."""
+    model = stretched_block_model()
+    points, state = model.points(PLACES), {"stretch": 0.1}
+    rounded = replace(model, name="again", nodes=model.nodes.astype(np.float32).astype(np.float64))
+    np.testing.assert_array_equal(rounded.at(state).displacement(points), model.at(state).displacement(points))
+    longer, fewer = replace(model, name="longer", nodes=1.001 * model.nodes), bent_sheet_model(3, 3)
+    assert len(fewer.nodes) <= points.corners.max()
+    for other, values in ((longer, state), (fewer, {})):
+        for use in (other.rest_positions, other.restrict, other.at(values).displacement, other.at(values).positions):
+            with pytest.raises(ParameterError, match=f"with another mesh than '{other.name}'"):
+                use(points)
+
+
 def test_a_point_in_a_long_cell_is_found_beside_many_short_ones():
     """Fifty centres are nearer to it than that of its own cell."""
     x = np.concatenate([[0.0], np.linspace(1.0, 1.05, 51)])
@@ -95,6 +111,9 @@ def test_outside_of_the_range_as_asked_for_and_by_rounding():
     np.testing.assert_allclose(model.at(beyond, "linear").displacement()[:, 0].max(), 0.1 * SIZE[0] + 0.02)
     rounded = model.at({"slide": 0.01 * (1.0 + 1e-9), "stretch": 0.1})
     np.testing.assert_array_equal(rounded.positions(), end.positions())
+    for use in (model.at, model.positions, lambda values, word: model.von_mises(values, outside=word)):
+        with pytest.raises(ParameterError, match="outside='foo' is not known: give 'bounded' or 'linear'"):
+            use([0.1, 0.0], "foo")
 
 
 def test_what_a_model_lacks_is_said_with_what_it_has(tmp_path):

@@ -375,6 +375,41 @@ def test_a_step_solid_is_meshed_and_its_unit_checked(tmp_path):
         load_mesh(path, "mm")
 
 
+def write_solids(path, **boxes):
+    """A STEP file of boxes, each (low corner, high corner) in mm, by the names of the solids."""
+    solids = []
+    for name, (low, high) in boxes.items():
+        (solid,) = occ.Box(low, high).solids
+        solid.name = name
+        solids.append(solid)
+    occ.Compound(solids).WriteStep(str(path))
+
+
+def test_touching_solids_of_a_step_file_are_one_mesh_with_a_set_each(tmp_path):
+    """A narrow box on a wide one: their common face is listed once, and its cells are the wide box's."""
+    write_solids(tmp_path / "two.step", soft=((0, 0, 0), (20, 10, 10)), stiff=((20, 2, 2), (30, 8, 8)))
+    mesh = load_mesh(tmp_path / "two.step", "mm", size=0.005)
+    check_mesh(mesh, regions=("soft", "stiff"))
+    volumes = cell_volumes(mesh)
+    assert volumes[mesh.cells("soft")].sum() == pytest.approx(2e-6, rel=1e-9)
+    assert volumes[mesh.cells("stiff")].sum() == pytest.approx(3.6e-7, rel=1e-9)
+    areas = sorted(round(1e6 * surface_area(mesh, name), 6) for name in mesh.surfaces if name.startswith("face_"))
+    assert areas == [36, 36, 60, 60, 60, 60, 64, 100, 200, 200, 200, 200]
+    outer = {tuple(face) for face in mesh.boundary_faces().tolist()}
+    (between,) = (faces for faces in mesh.surfaces.values() if not outer & {tuple(face) for face in faces.tolist()})
+    assert np.isin(between[:, 0], mesh.cells("soft")).all()
+    assert mesh.nodes[np.unique(mesh.face_nodes(between)), 0] == pytest.approx(0.02, abs=1e-9)
+
+
+def test_solids_of_a_step_file_that_lie_apart_or_overlap_are_refused(tmp_path):
+    write_solids(tmp_path / "apart.step", soft=((0, 0, 0), (20, 10, 10)), stiff=((21, 0, 0), (30, 10, 10)))
+    with pytest.raises(StudyError, match="the mesh falls into 2 parts that share no node"):
+        check_mesh(load_mesh(tmp_path / "apart.step", "mm", size=0.005))
+    write_solids(tmp_path / "overlap.step", soft=((0, 0, 0), (20, 10, 10)), stiff=((18, 0, 0), (30, 10, 10)))
+    with pytest.raises(StudyError, match=r"the 2 solids of .*overlap\.step overlap by 200 mm3, .*: cut one out"):
+        load_mesh(tmp_path / "overlap.step", "mm", size=0.005)
+
+
 def test_a_ply_file_that_ends_in_its_header_is_refused(tmp_path):
     """meshio would read on for ever."""
     (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 8\nproperty float x\n")

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import platform
+import re
 import runpy
 import tomllib
 from dataclasses import replace
@@ -55,3 +56,16 @@ def test_every_key_stands_in_the_reference():
     assert "| `held_out` | whole number | `59` |" in page
     assert "| `thickness` | length |" in page
     assert page.count("| key | value | default |") > 25
+    for text in ("[[mesh.collars]]", "[[mesh.holes]]"):  # sections in a section
+        assert page.count(f"`{text}`") == 1
+    assert re.findall(r"\b_[A-Z]\w+|``|6\.28\S*|NoneType", page) == []
+    assert "| `angles` | [angle, angle] | `[0.0, 2 pi]` |" in page
+    assert '| `description` | text | `""` |' in page
+
+
+def test_the_reference_of_shells_has_no_key_that_they_refuse():
+    page = runpy.run_path(str(PROJECT / "docs" / "study_keys.py"))["study_reference"]()
+    solids, shells, _, _ = page.split("\n## ")
+    assert "| `first` | true or false |" in solids
+    assert "| `first` | true or false |" not in shells
+    assert "| `first` | whole number |" in shells  # of [sampling]

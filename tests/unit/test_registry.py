@@ -1,6 +1,7 @@
 """A method of reduction and a law of one's own: registered in a few lines, and named in a study."""
 
 import tomllib
+from dataclasses import replace
 from typing import ClassVar
 
 import ngsolve as ngs
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 
 from morph_dslam import build, make_study
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import ArgumentError, StudyError
 from morph_dslam.extend import register_law, register_reduction
 from morph_dslam.mechanics.materials import base
 from morph_dslam.mechanics.materials.base import Constant
 from morph_dslam.mechanics.materials.isotropic import Rubber, first_invariant
+from morph_dslam.mechanics.materials.library import laws
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
@@ -62,6 +64,50 @@ def test_a_name_that_nobody_registered_is_refused_with_those_known(registered):
         make_study(external)
 
 
+@pytest.mark.parametrize("name", ["galerkin", "reduced_basis", "pod", "sparse_pgd"])
+def test_built_in_methods_are_not_replaced(registered, name):
+    before = registry.reduction_method(name)
+    with pytest.raises(ArgumentError, match=f"'{name}' is a built-in method of reduction"):
+        register_reduction(name, reduce_by_planes)
+    assert registry.reduction_method(name) is before
+    assert set(registry.reduction_methods()) == {*registry._BUILT_IN, "planes"}
+
+
+def spoilt(change):
+    """The method of planes with its displacement changed."""
+
+    def reduce(task):
+        model = reduce_by_planes(task)
+        field = model.displacement
+        return replace(model, displacement=SeparatedField(change(field.modes), field.functions))
+
+    return reduce
+
+
+@pytest.mark.parametrize(
+    ("reduce", "message"),
+    [
+        (lambda task: None, r"method of reduction 'mine' returned an object of type NoneType: return task\.model\("),
+        (lambda task: task.model({}, {}), "the fields of a reduced model are none: give those of task.field_names"),
+        (spoilt(lambda modes: modes[:, :5]), r"'displacement' of shape \(5, 3\), and that of a solution is \(44, 3\)"),
+        (spoilt(lambda modes: np.nan * modes), "the field 'displacement' with values that are not finite"),
+        (spoilt(lambda modes: np.where(modes == modes.max(), np.inf, modes)), "values that are not finite"),
+    ],
+)
+def test_what_a_method_returns_is_checked(registered, reduce, message):
+    register_reduction("mine", reduce)
+    sampling = {"training": 8, "held_out": 4}
+    study = make_study(tomllib.loads(STUDY) | {"sampling": sampling, "reduction": {"method": "mine"}})
+    with pytest.raises(StudyError, match=message):
+        build(study)
+
+
+@pytest.mark.parametrize("workers", ["2", 0, -1, 1.5])
+def test_workers_are_counted(workers):
+    with pytest.raises(ArgumentError, match=r"workers is .*: give a number of processes from 1 on"):
+        build(make_study(tomllib.loads(STUDY)), workers=workers)
+
+
 STRIP = {
     "name": "strip",
     "mesh": {"generator": "block", "size": ["1 m"] * 3, "divisions": [1, 1, 1], "cells": "hex20"},
@@ -78,6 +124,36 @@ STRIP = {
 def own_laws(monkeypatch):
     """Laws that are registered meanwhile, forgotten afterwards."""
     monkeypatch.setattr(base, "_LAWS", dict(base._LAWS))
+
+
+def test_a_law_that_cannot_be_one_is_refused_and_the_built_in_stays(own_laws):
+    class Own(Rubber):
+        mu: Constant
+
+    class Whole(Own):
+        def distortional(self, F, J):
+            return 0.5 * self.mu * (first_invariant(F, J) - 3.0)
+
+    class Measured(Whole):
+        quantities: ClassVar = {"mu": "furlong"}
+
+    before = laws()
+    for name, law, message in (
+        ("neo_hookean", Whole, "'neo_hookean' is a built-in law: register yours by another name"),
+        ("own", Own, "the law 'own' has no method distortional: define it in the class Own"),
+        ("own", Measured, r"the law 'own' has quantities = {'mu': 'furlong'}: give one of length, stress"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            register_law(name)(law)
+        assert laws() == before
+    register_law("own")(Whole)
+
+    @register_law("own")
+    class Again(Own):
+        def distortional(self, F, J):
+            return self.mu * (first_invariant(F, J) - 3.0)
+
+    assert laws() == before | {"own": Again}
 
 
 def test_a_law_of_ones_own_is_named_in_a_study_and_solved(own_laws):

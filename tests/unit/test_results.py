@@ -114,13 +114,13 @@ def test_summary_counts_and_flags():
     assert (summary["n_frames"], summary["n_tracked"], summary["n_lost"]) == (3, 2, 1)
     assert summary["median_ms"] == pytest.approx(2.0 * len(STAGES) + 0.5)
     assert summary["median_n_inliers"] == 280
-    lost, at_bound, unobservable = notices_of(run)
+    at_bound, lost, unobservable = notices_of(run)
     assert lost == RunNotice.of(RunWarning.LOST, count=1, n_frames=3)
     data = {"parameter": "arch", "side": "upper", "bound": "60 mm", "count": 1}
     assert at_bound == RunNotice.of(RunWarning.AT_BOUND, **data)
     assert (unobservable.warning, unobservable.data["parameters"]) == (RunWarning.UNOBSERVABLE, ["skew"])
-    assert summary["flags"] == [lost.text, at_bound.text, unobservable.text]
-    assert summary["notices"][1] == {"kind": "at_bound", **data, "text": at_bound.text}
+    assert summary["flags"] == [at_bound.text, lost.text, unobservable.text]
+    assert summary["notices"][0] == {"kind": "at_bound", **data, "text": at_bound.text}
     # Were it an angle about an axis of revolution, it would be the same a turn further on.
     turning = replace(run, revolution_angles=("arch",))
     assert notices_of(turning) == [lost, unobservable]
@@ -147,8 +147,8 @@ def test_fields_that_the_model_misses_are_named_and_forces_say_what_their_deviat
     assert "misses 34 % of von Mises stress at held-out solutions" in flag["text"]
     print_summary(tmp_path, summary)
     said = capsys.readouterr().out
-    assert "N in frame 0, not counting the model's own error, 6 %\n" in said
-    assert "N in frame 0, not counting the model's own reduction error, 390 %\n" in said
+    assert "N in frame 0, not counting the model's own error at given parameters, 6 %\n" in said
+    assert "N in frame 0, not counting the model's own reduction error at given parameters, 390 %\n" in said
     sides = {name: {**entry, "largest_N": 50.0} for name, entry in certificate.items() if name.endswith("_side")}
     swapped = replace(run, model=replace(model, certificate=certificate | sides))
     assert "34 % of von Mises stress and 390 % of forces" in notices_of(swapped)[0].text
@@ -162,6 +162,38 @@ def test_a_bound_where_the_undeformed_object_rests_is_no_warning():
     run.add(1, 0.1, frame_result([0.06, 0.1, 0.0], [1e-3, 0.05, 0.01], [True, False, False]))
     (reached,) = notices_of(run)
     assert (reached.warning, reached.data["side"]) == (RunWarning.AT_BOUND, "upper")
+
+
+def held(stated, widened, parameters=(0.06, 0.1, 0.0), **facts):
+    """A frame whose arch is at a bound; its deviation (m) as stated, and as the residuals widen it."""
+    result = frame_result(parameters, [widened, 0.05, 0.01], [True, False, False])
+    covariance = np.diag([stated**2, 0.05**2, 0.01**2, *[1e-8] * 6])
+    return replace(result, estimate=replace(result.estimate, stated_covariance=covariance), **facts)
+
+
+def test_a_range_that_is_left_is_named_in_all_frames_and_not_as_unobservable():
+    """The arch's range is 120 mm wide: deviations from 30 mm on leave it open."""
+    run = RunResults(bent_sheet_model(22, 16), reference_frame=0)
+    run.add(0, 0.0, held(1e-3, 5e-3))
+    run.add(1, 0.1, held(1e-3, 0.05, unexplained_px=0.8))
+    run.add(2, 0.2, held(1e-3, 0.05, reference_factor=9.0))
+    first, *others = notices_of(run)
+    assert first == RunNotice.of(RunWarning.AT_BOUND, parameter="arch", side="upper", bound="60 mm", count=3)
+    assert [notice.warning for notice in others] == [RunWarning.REFERENCE_WIDENED]
+
+
+@pytest.mark.parametrize(
+    ("stated", "widened", "facts"),
+    [
+        (0.05, 0.05, {"unexplained_px": 0.8}),  # nobody knows where it is, with the misfit or without
+        (1e-3, 0.05, {"unexplained_px": 0.05}),  # what is hidden in part widened it, not the residuals
+    ],
+)
+def test_what_the_images_do_not_determine_is_not_said_to_have_left_its_range(stated, widened, facts):
+    run = RunResults(bent_sheet_model(22, 16), reference_frame=0)
+    run.add(0, 0.0, held(stated, widened, **facts))
+    (unobservable,) = notices_of(run)
+    assert unobservable.data["parameters"] == ["arch"]
 
 
 def test_stress_shown_is_that_of_the_side_turned_to_the_camera():

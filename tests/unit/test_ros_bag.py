@@ -159,5 +159,5 @@ def test_bags_that_are_refused(tmp_path, monkeypatch):
     with pytest.raises(SourceError, match="empty cannot be read as a ROS bag"):
         open_source(tmp_path / "empty")
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(SourceError, match=r'pip install "morph-dslam\[ros\]"'):
+    with pytest.raises(SourceError, match=r"pip install '\.\[ros\]'"):
         open_source(path)

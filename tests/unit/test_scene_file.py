@@ -166,7 +166,7 @@ def test_packaged_photograph(tmp_path):
 def test_packaged_photograph_without_the_package(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "skimage", raising=False)
     monkeypatch.setattr("morph_dslam.render.texture.find_spec", lambda name: None)
-    with pytest.raises(SceneError, match=r'pip install "morph-dslam\[demo\]"'):
+    with pytest.raises(SceneError, match=r"pip install '\.\[demo\]'"):
         load_photograph("coffee", tmp_path)
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morph_dslam import sources
 from morph_dslam.errors import SourceError
 from morph_dslam.extend import register_source
 from morph_dslam.io.video import VideoWriter
@@ -401,5 +402,53 @@ def test_a_registered_kind_of_source_opens_as_any_other(tmp_path):
         assert [(f.index, int(f.image[0, 0, 0])) for f in opened(tmp_path / "film.npy", 1, 2)] == [(1, 1), (2, 2)]
     with open_live(tmp_path / "film.npy", 3) as stream:
         assert [frame.index for frame in stream] == [3]
+    assert open_source(tmp_path / "film.npy", 2).images.shape == (4, 8, 6, 3)  # an attribute of its own
     with pytest.raises(SourceError, match=r"frame 9 is not in .*film\.npy"):
         open_source(tmp_path / "film.npy", 9)
+
+
+class Items:
+    """A source of any items, without a length."""
+
+    name, fps = "items", 10.0
+
+    def __init__(self, *items):
+        self.items = items
+
+    def __iter__(self):
+        return iter(self.items)
+
+
+class Listed(Items):
+    """One with a length."""
+
+    def __len__(self):
+        return len(self.items)
+
+
+def numbered(*numbers):
+    return [Frame(number, 0.1 * place, grey(0)) for place, number in enumerate(numbers)]
+
+
+@pytest.mark.parametrize(
+    ("opened", "message", "n_before"),
+    [
+        (None, r"film\.any opens it as an object of type NoneType, without name: return one with name, fps", 0),
+        (numbered(0), "of type list, without name", 0),
+        (Items(*numbered(0)), r"film\.any has no length, .* give what opens it a method __len__", 0),
+        (Listed(*numbered(3, 4, 4)), "items gives frame 4 after frame 4: number frames in the order", 2),
+        (Listed(*numbered(4, 2)), "items gives frame 2 after frame 4", 1),
+        (Listed(grey(0)), "items gives an object of type ndarray at first: give md.Frame objects", 0),
+        (Listed(*numbered(4), None), "items gives an object of type NoneType after frame 4", 1),
+    ],
+)
+def test_mistakes_of_a_registered_source_are_named(opened, message, n_before, tmp_path, monkeypatch):
+    """The frames before the mistake come first."""
+    monkeypatch.setattr(sources, "_KINDS", list(sources._KINDS))
+    register_source(lambda path: path.suffix == ".any", lambda path, first, last: opened)
+    before = []
+    with pytest.raises(SourceError, match=message):
+        before.extend(open_source(tmp_path / "film.any"))
+    assert len(before) == n_before
+    if type(opened) is Items:
+        assert [frame.index for frame in open_stream(tmp_path / "film.any")] == [0]

@@ -308,6 +308,17 @@ def test_frames_before_the_scene_are_refused(publisher, model):
         StreamSink([publisher])(tracked_frame(0, 0.0, block=tracked_result(model, 0.1, 0.0)))
 
 
+def test_another_object_than_the_stream_was_begun_with_is_refused(publisher, model):
+    """Whether anybody watches or not; an object that is not streamed may be tracked beside."""
+    sink = StreamSink([publisher]).begin({"block": model}, CAMERA)
+    one, other = tracked_result(model, 0.1, 0.0), tracked_result(model, 0.0, 0.0)
+    with pytest.raises(
+        StreamError, match="begun with the object 'block', and the session tracks seal, hand: give begin"
+    ):
+        sink(tracked_frame(0, 0.0, seal=one, hand=other))
+    sink(tracked_frame(0, 0.0, block=one, hand=other))
+
+
 def test_a_system_that_has_nothing_left_is_one_message(monkeypatch):
     def exhausted(*_, **__):
         raise OSError(24, "Too many open files")

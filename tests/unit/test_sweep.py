@@ -86,6 +86,22 @@ def test_too_few_solved_is_an_error_that_names_the_first_failure(monkeypatch, tm
     assert len(list(tmp_path.glob("*.npz"))) == 1
 
 
+def test_the_first_failure_is_said_before_anything_else_is_tried(monkeypatch, tmp_path, capsys):
+    said: list[str] = []
+
+    def solvable(bulge, origin):
+        said.append(capsys.readouterr().err)
+        return bulge < 0.007
+
+    stand_in(monkeypatch, solvable)
+    with pytest.raises(StudyError, match="only 1 of 4"):
+        sweep.run_sweep(STUDY, row([0.006, 0.012, 0.016, 0.02]), tmp_path, SerialExecutor())
+    said.append(capsys.readouterr().err)
+    telling = [number for number, text in enumerate(said) if "a sample could not be solved: no equilibrium. " in text]
+    assert telling == [2], "the second of all attempts fails, and no later failure is told"
+    assert STUDY.advice in said[2]
+
+
 def test_solved_samples_are_not_solved_again(monkeypatch, tmp_path):
     samples = row([0.008, 0.012, 0.016])
     stand_in(monkeypatch, lambda bulge, origin: True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from morph_dslam.camera import LensModel
 from morph_dslam.errors import CameraError
 from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.writing import writing
 
 DPI = 110
 #: Residuals are drawn this many times their length.
@@ -183,19 +183,10 @@ def calibrate(
     found = collect_views([Path(source) for source in sources], board, ignored=picture)
     calibration = Calibration(solve_intrinsics(found.views, board, found.size, lens_model), found, board, picture)
     if output is not None and picture is not None:
-        with writing():
+        with writing(CameraError):
             save_camera(Path(output), calibration.solution.camera)
             plot_calibration(picture, calibration.solution)
     return calibration
-
-
-@contextmanager
-def writing() -> Iterator[None]:
-    """Say which file of a calibration cannot be written (CameraError)."""
-    try:
-        yield
-    except OSError as error:
-        raise CameraError(f"cannot write {error.filename}: {error.strerror}") from error
 
 
 def check_output(output: Path) -> Path:

@@ -19,13 +19,14 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
 from morph_dslam.calibration.board import CalibrationBoard
-from morph_dslam.calibration.calibrate import Calibration, check_output, plot_calibration, writing
+from morph_dslam.calibration.calibrate import Calibration, check_output, plot_calibration
 from morph_dslam.calibration.solve import HARMLESS, OUTLIER_RATIO, solve_intrinsics
 from morph_dslam.calibration.views import View, best_views, find_views, sampling_step, select_by_coverage
 from morph_dslam.camera import Camera, LensModel
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.camera_files import save_rig
+from morph_dslam.io.writing import writing
 
 Array = NDArray[np.float64]
 #: So many frames that two cameras share place one by the other.
@@ -123,7 +124,7 @@ def calibrate_rig(
     rig = _solve(cameras, seen)
     if output is not None:
         lenses = [calibration.solution.camera for calibration in cameras]
-        with writing():
+        with writing(CameraError, Path(output)):
             save_rig(Path(output), list(zip(lenses, rig.camera_from_first, strict=True)))
             for calibration in cameras:
                 assert calibration.picture is not None

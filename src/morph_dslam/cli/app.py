@@ -16,7 +16,7 @@ from importlib import import_module
 from morph_dslam._version import __version__
 from morph_dslam.cli.arguments import with_signed_sections
 from morph_dslam.cli.interruption import Interruption, interrupt_behind
-from morph_dslam.errors import MorphError
+from morph_dslam.errors import MorphError, refusal
 
 #: Commands in the order in which `morph --help` lists them.
 COMMANDS = (
@@ -77,6 +77,11 @@ def run_and_report_errors(
         return OUTPUT_CLOSED
     except MorphError as error:
         print(f"morph: {error}", file=sys.stderr)
+        return USER_ERROR
+    except OSError as error:
+        if error.errno is None:  # of a library, not of the system
+            raise
+        print(f"morph: {refusal(error)}", file=sys.stderr)
         return USER_ERROR
     except (KeyboardInterrupt, SystemError) as error:
         interrupt = interrupt_behind(error)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+#: Units that coordinates of a file may be in.
+LENGTH_UNITS = ("m", "cm", "mm", "um")
 #: No value in whatever unit is meant by what is larger: its square could overflow.
 LARGEST = 1e30
 
@@ -101,6 +103,20 @@ def named_value(text: str) -> tuple[str, float]:
     if not name or not 0.0 < value < LARGEST:
         raise argparse.ArgumentTypeError(f"'{text}' is not a name and a positive number such as load=0.5")
     return name, value
+
+
+def named_place(text: str) -> tuple[str, tuple[float, float, float]]:
+    """A name and coordinates in millimetres, "NAME=X,Y,Z", in metres."""
+    name, _, place = text.partition("=")
+    try:
+        x, y, z = (1e-3 * float(value) for value in place.split(","))
+    except ValueError:
+        x = y = z = float("nan")
+    if not name.strip() or not max(abs(x), abs(y), abs(z)) < LARGEST:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a name and three coordinates in millimetres such as tip=98,10,8"
+        )
+    return name.strip(), (x, y, z)
 
 
 def file_and_column(text: str) -> tuple[Path, str | None]:

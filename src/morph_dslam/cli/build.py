@@ -4,7 +4,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from morph_dslam.cli.arguments import add_file, add_output, positive_integer
+from morph_dslam.cli.arguments import LENGTH_UNITS, add_file, add_output, positive_integer
 from morph_dslam.errors import StudyError
 
 HELP = "solve a study over its parameters and compress the solutions in a model file, or make one of a rigid surface"
@@ -12,15 +12,21 @@ KEPT = "the solutions found so far are kept, and the same command goes on from t
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("study", type=Path, nargs="?", metavar="STUDY", help="study file (docs/study-file.md)")
+    command.add_argument(
+        "study",
+        type=Path,
+        nargs="?",
+        metavar="STUDY",
+        help="study file, or the folder of a file study.toml (docs/study-file.md, solid-study.md, shell-study.md)",
+    )
     add_file(command, "--rigid", ".stl, .obj or .ply file of a rigid object, in place of a study", "SURFACE")
-    command.add_argument("--unit", choices=("m", "cm", "mm"), help="unit of that file's coordinates")
+    command.add_argument("--unit", choices=LENGTH_UNITS, help="unit of that file's coordinates")
     add_output(command, "MODEL", "model file to write")
     command.add_argument(
         "--workers",
         type=positive_integer,
         metavar="N",
-        help="processes to solve in (default: the study's; without any one for solids, else one a core)",
+        help="processes to solve in (default: the study's number, else 1 for solids, one a core for sheets and shells)",
     )
     add_file(
         command,
@@ -73,7 +79,7 @@ def _build_rigid(arguments: argparse.Namespace) -> None:
     from morph_dslam.extend.studies import build_rigid
 
     if arguments.unit is None:
-        raise StudyError(f"say in which unit {arguments.rigid} was drawn: --unit m, cm or mm")
+        raise StudyError(f"say in which unit {arguments.rigid} was drawn: --unit {', '.join(LENGTH_UNITS)}")
     if arguments.workers is not None or arguments.reference_curve is not None:
         raise StudyError("--workers and --reference-curve are for studies; leave them out with --rigid")
     model = build_rigid(arguments.rigid, arguments.unit, arguments.output)

@@ -125,8 +125,10 @@ def _videos() -> Iterator[tuple[str, str]]:
 
 
 def _extras() -> Iterator[tuple[str, str]]:
+    from morph_dslam.errors import how_to_install
+
     for extra, (module, brings) in EXTRAS.items():
-        missing = f"not installed: pip install '.[{extra}]'"
+        missing = f"not installed: {how_to_install(extra)}"
         yield f"extra {extra}", f"{'installed' if find_spec(module) else missing} ({brings})"
 
 

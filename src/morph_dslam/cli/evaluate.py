@@ -34,7 +34,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--bind-frame",
         type=int,
         metavar="N",
-        help="with --points and --pixels: frame whose pixels bind the points to the mesh",
+        help="with --points and --pixels: frame whose pixels bind the points to the mesh (default: the first one that "
+        "was tracked and measured)",
     )
     command.add_argument(
         "--reaction", metavar="SET[:AXIS]", help="with --force: the support, and x, +x, -x, y ... of the object frame"
@@ -79,6 +80,9 @@ def run(arguments: argparse.Namespace) -> None:
         print(force_line(figures))
     else:
         figures = evaluate(folder, arguments.points, arguments.bind_frame)
+        if arguments.bind_frame is None:
+            frame = figures["bind_frame"]
+            print(f"note: points are bound in frame {frame}; if another shows more of them, name it by --bind-frame")
         _print_notes(remarks(figures))
         print(f"wrote {folder / 'evaluation.json'} and {folder / 'report.html'}")
         print(alignment_line(figures))
@@ -98,5 +102,3 @@ def _check(arguments: argparse.Namespace) -> None:
         raise EvaluationError("--bind-frame goes with --points and --pixels: leave it out")
     if arguments.force is None and arguments.reaction is not None:
         raise EvaluationError("--reaction goes with --force: leave it out")
-    if arguments.points is not None and arguments.bind_frame is None:
-        raise EvaluationError("--points needs --bind-frame N, the frame whose pixels bind the points to the mesh")

@@ -37,7 +37,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         dest="run_folder",
         type=Path,
         metavar="RUN",
-        help="run folder of the video: its frames, and its estimates of parameters that are one over the sequence",
+        help="run folder of the video: its frames, and its estimates of per-sequence parameters",
     )
     add_output(command, "OUT", "folder to write")
 
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _from_pictures(folder: Path, model: ReducedModel) -> dict[str, tuple[float, float]]:
-    """Value and standard deviation, SI, of the parameters that a run found to be one over its sequence."""
+    """Value and standard deviation, SI, of the per-sequence parameters of a run."""
     known = json.loads((folder / "summary.json").read_text())["one_over_the_sequence"]
     units = {parameter.name: parameter.display(1.0) for parameter in model.parameters}
     return {

@@ -2,7 +2,7 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import add_file, positive_number
+from morph_dslam.cli.arguments import LENGTH_UNITS, add_file, positive_number
 
 HELP = "print what a model file holds, or the size and the named sets of a study's mesh or of a mesh file"
 KEPT = "nothing was written"
@@ -10,7 +10,7 @@ KEPT = "nothing was written"
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(command, "model", "model file, study file (.toml) or mesh file (docs/meshes.md)")
-    command.add_argument("--unit", choices=("m", "cm", "mm", "um"), help="of a mesh file's coordinates (default: mm)")
+    command.add_argument("--unit", choices=LENGTH_UNITS, help="of a mesh file's coordinates (default: mm)")
     command.add_argument(
         "--size",
         type=positive_number,

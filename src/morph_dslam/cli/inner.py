@@ -2,7 +2,7 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import add_file, add_output
+from morph_dslam.cli.arguments import LENGTH_UNITS, add_file, add_output
 
 HELP = "place a surface (a tumour, a vessel) inside of a solid, to be carried along by its model"
 KEPT = "nothing was written"
@@ -11,7 +11,7 @@ KEPT = "nothing was written"
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(command, "surface", ".stl, .obj or .ply file, drawn in the object's frame")
     add_file(command, "--model", "model file of the solid", required=True)
-    command.add_argument("--unit", required=True, choices=("m", "cm", "mm"), help="unit of the file's coordinates")
+    command.add_argument("--unit", required=True, choices=LENGTH_UNITS, help="unit of the file's coordinates")
     command.add_argument("--name", help="shown in results and video (default: the file's name)")
     add_output(command, "FILE", "file to write")
 

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from morph_dslam.cli.arguments import add_flag
-from morph_dslam.errors import StudioError
+from morph_dslam.errors import StudioError, how_to_install
 
 HELP = "build, place and track your own object by clicks in the browser"
 KEPT = "the files of the project are kept"
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
     missing = [name for name in _EXTRA if find_spec(name) is None]
     if missing:
         raise StudioError(
-            f"morph studio needs {', '.join(missing)}, which is not installed: pip install 'morph-dslam[studio]'"
+            f"morph studio needs {', '.join(missing)}, which is not installed: {how_to_install('studio')}"
         )
     from morph_dslam import open_studio
 

@@ -169,6 +169,10 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     for figures in summary["largest_forces"]:
         line = "largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures)
         print(line + _model_error(figures))
+    for figures in summary.get("points", []):
+        if "frame" in figures:
+            line = "largest displacement of '{name}': {displacement_mm:.4g} ± {standard_deviation_mm:.2g} mm in frame "
+            print((line + "{frame}").format(**figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
     if "live" in summary:
@@ -183,17 +187,17 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def _model_error(figures: dict[str, Any]) -> str:
-    """What a force's deviation does not contain, if the model states it."""
+    """What a force's deviation does not contain, if the model states it: it has what the mesh does to parameters."""
     if "model_error" not in figures:
         return ""
     of = "error" if figures["model_error_of"] == "all" else "reduction error"
-    return f", not counting the model's own {of}, {100.0 * figures['model_error']:.3g} %"
+    return f", not counting the model's own {of} at given parameters, {100.0 * figures['model_error']:.3g} %"
 
 
 def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
     """What `add_tracking_arguments` asked for, and more.
 
-    What is asked for of parameters, the outline and inner structures holds for the first object only.
+    What is asked for of parameters, the outline, inner structures and points holds for the first object only.
     """
     from morph_dslam import TrackerOptions, TrackOptions
     from morph_dslam.extend.registration import InitializerFiles
@@ -239,6 +243,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         initializer=InitializerFiles(arguments.board, arguments.picture, arguments.guess),
         map_path=arguments.map,
         inner=tuple(arguments.inner),
+        points=tuple(arguments.point),
         reregister_at=frames_of(""),
         tracker=replace(
             tracker,

@@ -13,6 +13,7 @@ from morph_dslam.cli.arguments import (
     add_range,
     add_repeated,
     frame_and_file,
+    named_place,
     named_value,
     positive_number,
 )
@@ -138,10 +139,10 @@ def _add_still(group: _Group) -> None:
         dest="pose",
         action="store_const",
         const="still",
-        help="camera and support stand still: the pose is one over the sequence, estimated from all frames",
+        help="camera and support stand still: one pose for the whole sequence, estimated from all frames",
     )
     add_flag(group, "--at-rest", "the object is undeformed in the frame of its landmarks")
-    add_repeated(group, "--per-sequence", "a parameter that is one over the whole sequence", "NAME")
+    add_repeated(group, "--per-sequence", "a per-sequence parameter: it has one value in the whole sequence", "NAME")
 
 
 def _add_forces(group: _Group) -> None:
@@ -168,6 +169,13 @@ def _add_forces(group: _Group) -> None:
 def _add_output(group: _Group, required: bool) -> None:
     add_output(group, "RUN", "run folder to write", required)
     add_flag(group, "--overwrite", "replace a run that is in the run folder")
+    add_repeated(
+        group,
+        "--point",
+        "write and plot the displacement of the undeformed object's point X,Y,Z, in millimetres",
+        "NAME=X,Y,Z",
+        named_place,
+    )
     group.add_argument(
         "--show",
         choices=("stress", "strain", "displacement", "traction"),

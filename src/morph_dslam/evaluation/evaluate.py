@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_depth
 from morph_dslam.evaluation.force import force_error, summarise_force
 from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
@@ -17,11 +18,12 @@ from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error,
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.trajectory import summarise_alignment
+from morph_dslam.io.writing import writing
 
 # What draws is imported where it draws: matplotlib takes long to load.
 
 
-def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: int) -> dict[str, Any]:
+def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: int | None = None) -> dict[str, Any]:
     """Compare a run with truth points.
 
     Of a run folder, ``evaluation.json``, pictures and ``report.html`` are written into it.
@@ -30,7 +32,7 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
     ----------
     run : a run folder, or a run in memory.
     truth : a truth file, or truth in memory.
-    bind_frame : the frame whose pixels bind the points.
+    bind_frame : the frame whose pixels bind the points; where absent, the first one of the truth that the run tracked.
 
     Returns
     -------
@@ -39,7 +41,8 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
     Raises
     ------
     EvaluationError
-        If the run and the truth cannot be read or do not fit together.
+        If the run and the truth cannot be read or do not fit together, or the folder
+        cannot be written to.
     """
     tracked = run if isinstance(run, Run) else load_run(run)
     points = truth if isinstance(truth, PointTruth) else load_truth(Path(truth))
@@ -56,10 +59,11 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
         folder = Path(run)
         from morph_dslam.evaluation.run_report import plot_error_map, plot_errors_by_frame, write_run_report
 
-        (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-        plot_errors_by_frame(folder / "evaluation.png", error)
-        plot_error_map(folder / "error_map.png", error, tracked.model)
-        write_run_report(folder, tracked)
+        with writing(EvaluationError, folder):
+            (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            plot_errors_by_frame(folder / "evaluation.png", error)
+            plot_error_map(folder / "error_map.png", error, tracked.model)
+            write_run_report(folder, tracked)
     return figures
 
 
@@ -87,7 +91,8 @@ def evaluate_depth(
     Raises
     ------
     EvaluationError
-        If the run or the depth images cannot be read or do not fit together.
+        If the run or the depth images cannot be read or do not fit together, or the folder
+        cannot be written to.
     """
     tracked = run if isinstance(run, Run) else load_run(run)
     path = str(depth) if isinstance(depth, str | Path) else None
@@ -99,9 +104,10 @@ def evaluate_depth(
         folder = Path(run)
         from morph_dslam.evaluation.run_report import plot_depth_error_map, plot_depth_errors_by_frame
 
-        (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-        plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
-        plot_depth_error_map(folder / "depth_error_map.png", error, tracked.model)
+        with writing(EvaluationError, folder):
+            (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
+            plot_depth_error_map(folder / "depth_error_map.png", error, tracked.model)
     return figures
 
 
@@ -126,7 +132,8 @@ def evaluate_pixels(
     Raises
     ------
     EvaluationError
-        If the run and the tracks cannot be read or do not fit together.
+        If the run and the tracks cannot be read or do not fit together, or the folder
+        cannot be written to.
     """
     tracked = run if isinstance(run, Run) else load_run(run)
     error = pixel_error(tracked, tracks if isinstance(tracks, PixelTracks) else load_tracks(tracks), bind_frame)
@@ -139,10 +146,11 @@ def evaluate_pixels(
         folder = Path(run)
         from morph_dslam.evaluation.run_report import plot_pixel_error_map, plot_pixel_errors_by_frame, write_run_report
 
-        (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-        plot_pixel_errors_by_frame(folder / "pixel_evaluation.png", error)
-        plot_pixel_error_map(folder / "pixel_error_map.png", error, tracked.model)
-        write_run_report(folder, tracked)
+        with writing(EvaluationError, folder):
+            (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            plot_pixel_errors_by_frame(folder / "pixel_evaluation.png", error)
+            plot_pixel_error_map(folder / "pixel_error_map.png", error, tracked.model)
+            write_run_report(folder, tracked)
     return figures
 
 
@@ -169,7 +177,8 @@ def evaluate_force(
     Raises
     ------
     EvaluationError
-        If the run and the curve cannot be read or do not fit together, or the model holds no reactions.
+        If the run and the curve cannot be read or do not fit together, the model holds no reactions, or the folder
+        cannot be written to.
     """
     tracked = run if isinstance(run, Run) else load_run(run)
     measured = curve if isinstance(curve, ForceCurve) else load_curve(curve, tracked.model, column)
@@ -180,9 +189,10 @@ def evaluate_force(
         folder = Path(run)
         from morph_dslam.evaluation.run_report import plot_force, write_run_report
 
-        (folder / "force_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-        plot_force(folder / "force_evaluation.png", error)
-        write_run_report(folder, tracked)
+        with writing(EvaluationError, folder):
+            (folder / "force_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            plot_force(folder / "force_evaluation.png", error)
+            write_run_report(folder, tracked)
     return figures
 
 

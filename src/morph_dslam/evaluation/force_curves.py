@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.io.text import read_csv
+from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import ReducedModel
 from morph_dslam.units import FACTORS
 
@@ -33,7 +32,6 @@ _OTHER_UNITS = {
     *("dyn", "kp", "kip", "kips", "tf", "ton", "tons", "lbs", "grams", "pounds"),
     *("nm", "nmm", "psi", "mv", "uv", "volt", "volts"),
 }
-_BRACKETED = re.compile(r"(.*\S)\s*\[(.+)\]")
 
 
 @dataclass(frozen=True)
@@ -131,14 +129,6 @@ def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, flo
             f"{parameter_columns(model)}"
         )
     return found
-
-
-def name_and_unit(header: str) -> tuple[str, str]:
-    """Both parts of a column's header, "stroke_mm" or "stroke [mm]"."""
-    if bracketed := _BRACKETED.fullmatch(header):
-        return bracketed[1], bracketed[2]
-    name, _, unit = header.rpartition("_")
-    return name, unit
 
 
 def parameter_of_column(header: str, model: ReducedModel) -> tuple[str, float] | None:

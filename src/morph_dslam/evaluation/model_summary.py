@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.parameter_errors import ENTRY, ERRORS
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, TensorTrainFunctions, TuckerFunctions
 
 #: Endings of certificate keys and the unit they stand for.
@@ -106,10 +107,18 @@ def error_facts(model: ReducedModel) -> Facts:
         **facts,
         "finer elements": f"{discretisation['method']}; {finer} unknowns in place of {coarse}",
     }
+    if ENTRY in discretisation:
+        facts["as errors of the parameters"] = _as_parameters(model, discretisation[ENTRY][ERRORS])
     if "left_out" in discretisation:
         facts["states left out"] = discretisation["left_out"]
     described = [describe_point(model.parameters, state) for state in states]
     return facts | {f"state solved again {n}": text for n, text in enumerate(described, start=1)}
+
+
+def _as_parameters(model: ReducedModel, errors: Mapping[str, Any]) -> str:
+    """What the discretisation error amounts to in each parameter, root mean square over the states."""
+    values = [float(np.sqrt(np.mean(np.square(errors[p.name])))) for p in model.study_parameters]
+    return describe_point(model.study_parameters, values) + " (root mean square)"
 
 
 def main_errors(errors: Mapping[str, Any]) -> dict[str, float]:

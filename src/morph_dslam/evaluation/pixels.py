@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.points import OUTLINE_TOLERANCE_PX, bind_pixels, frames_in_words, millimetres
-from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.evaluation.points import OUTLINE_TOLERANCE_PX, bind_pixels, millimetres
+from morph_dslam.evaluation.run_folder import Run, frames_in_words
 from morph_dslam.io.text import read_csv
 from morph_dslam.model import SurfacePoints
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.evaluation.run_folder import Run, frames_in_words
 from morph_dslam.model import SurfacePoints
 from morph_dslam.render.picking import nearest_on_outline, pick_surface
 
@@ -83,8 +82,6 @@ def load_truth(path: str | Path) -> PointTruth:
 
 #: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.
 OUTLINE_TOLERANCE_PX = 5.0
-#: More frames than these are not named one by one in messages.
-MOST_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -168,15 +165,22 @@ def bind_pixels(run: Run, row: int, recorded: Array) -> tuple[SurfacePoints, int
     return points, int(close.sum())
 
 
-def frames_in_words(frames: Iterable[int]) -> str:
-    """Frame numbers, "0, 10 and 20" say; of many, how many there are and of what range."""
-    numbers = sorted(map(int, frames))
-    if not numbers:
-        return "none"
-    if len(numbers) > MOST_NAMED:
-        return f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]}"
-    *others, last = map(str, numbers)
-    return f"{', '.join(others)} and {last}" if others else last
+def first_to_bind_in(run: Run, truth: PointTruth) -> int:
+    """The first frame of the truth in which the run tracked the object and pixels of visible points were measured.
+
+    Raises
+    ------
+    EvaluationError
+        If there is none.
+    """
+    measured = (np.isfinite(truth.pixels).all(axis=2) & ~truth.hidden).any(axis=1)
+    tracked = np.isin(truth.frames, run.frames[run.tracked])
+    if not (measured & tracked).any():
+        frames = frames_in_words(truth.frames[measured])
+        raise EvaluationError(
+            f"the run tracked none of the frames in which the truth has pixels ({frames}): give the truth of its frames"
+        )
+    return int(truth.frames[measured & tracked].min())
 
 
 def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
@@ -201,8 +205,9 @@ def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     return Binding(frame, columns[bound], points.take(bound), n_outline, unbound, n_unseen)
 
 
-def material_error(run: Run, truth: PointTruth, bind_frame: int) -> MaterialError:
-    """Compare every truth frame except the binding one with the run."""
+def material_error(run: Run, truth: PointTruth, bind_frame: int | None = None) -> MaterialError:
+    """Compare every truth frame except the binding one, by default that of `first_to_bind_in`, with the run."""
+    bind_frame = first_to_bind_in(run, truth) if bind_frame is None else bind_frame
     binding = bind_truth(run, truth, bind_frame)
     corners, weights = run.model.triangles[binding.points.triangles], binding.points.weights
     frames, vectors, truths, sight, untracked, outside = [], [], [], [], [], []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import EvaluationError
+from morph_dslam.errors import EvaluationError, check_kind
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.model import ReducedModel, load_model
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 FORMAT = "morph-dslam run"
 VERSION = 1
+#: More frames than these are not named one by one in messages.
+MOST_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,19 @@ class Run:
 
     @classmethod
     def of(cls, camera: Camera, results: Mapping[int, FrameResult]) -> Run:
-        """The run of results (at least one) by frame number, as a `morph_dslam.Tracker` returns them."""
+        """The run of results by frame number, as a `morph_dslam.Tracker` returns them.
+
+        Raises
+        ------
+        ArgumentError
+            If the camera is none, or the results are not by frame number.
+        EvaluationError
+            If there is no result.
+        """
+        check_kind(camera, Camera, "camera", "the camera that load_camera reads from the file, or Camera(...)")
+        check_kind(results, Mapping, "results", "the result of each frame by its number, {0: result}")
+        if not results:
+            raise EvaluationError("there are no results to make a run of: give that of at least one frame")
         found = list(results.values())
         lost = np.full((4, 4), np.nan)
         return cls(
@@ -152,13 +166,25 @@ def load_run(folder: str | Path) -> Run:
     return run
 
 
+def frames_in_words(frames: Iterable[int]) -> str:
+    """Frame numbers, "0, 10 and 20" say; of many, how many there are and of what range."""
+    numbers = sorted(map(int, frames))
+    if not numbers:
+        return "none"
+    if len(numbers) > MOST_NAMED:
+        return f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]}"
+    *others, last = map(str, numbers)
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def remarks(figures: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures must know: truth that could not be compared."""
     lines = []
     if figures["truth_frames_not_tracked"]:
-        lines.append(f"truth frames that were not tracked and so not compared: {figures['truth_frames_not_tracked']}")
+        missing = frames_in_words(figures["truth_frames_not_tracked"])
+        lines.append(f"truth frames that were not tracked and so not compared: {missing}")
     if figures["truth_frames_outside_the_run"]:
-        lines.append(f"truth frames outside the run: {figures['truth_frames_outside_the_run']}")
+        lines.append(f"truth frames outside the run: {frames_in_words(figures['truth_frames_outside_the_run'])}")
     if figures["points_not_bound"]:
         unseen = figures["n_points_unseen"]
         off = len(figures["points_not_bound"]) - unseen

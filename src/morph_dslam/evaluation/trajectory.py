@@ -23,6 +23,7 @@ from morph_dslam.evaluation.points import MaterialError, millimetres
 from morph_dslam.evaluation.trajectory_notes import clock_advice, pair_notes, pose_notes, size_notes
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
+from morph_dslam.io.writing import writing
 from morph_dslam.slam.map_files import is_metric_map
 
 Array = NDArray[np.float64]
@@ -241,8 +242,9 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     mistakes = [*pair_notes(len(estimate), loaded, whole), *pose_notes(estimate, expected)]
     figures["notes"] = [*mistakes, *_scale_notes(figures, bool(mistakes))]
     if path is not None:
-        path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-        plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, expected, *errors["sim3"])
+        with writing(EvaluationError, path.parent):
+            path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, expected, *errors["sim3"])
     return figures
 
 

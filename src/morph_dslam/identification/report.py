@@ -11,9 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import reaction_remark
 from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
+from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter
 
 DPI = 110
@@ -160,10 +162,11 @@ def last_line(figures: Mapping[str, Any]) -> str:
 
 def write_identification(folder: Path, found: Identification) -> dict[str, Any]:
     """Write ``identification.json`` and ``identification.png``; returns the figures."""
-    folder.mkdir(parents=True, exist_ok=True)
     figures = summarise(found)
-    (folder / "identification.json").write_text(json.dumps(figures, indent=2) + "\n")
-    plot(folder / "identification.png", found.misfits)
+    with writing(IdentificationError, folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "identification.json").write_text(json.dumps(figures, indent=2) + "\n")
+        plot(folder / "identification.png", found.misfits)
     return figures
 
 

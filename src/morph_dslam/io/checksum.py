@@ -14,6 +14,9 @@ from pathlib import Path
 
 import h5py
 
+from morph_dslam.io.hdf5_writing import written_hdf5
+from morph_dslam.io.writing import removed_on_failure
+
 #: Length of the block in bytes; HDF5 asks for a power of two from 512.
 BLOCK = 512
 #: How every HDF5 file begins that has no block before it.
@@ -31,10 +34,11 @@ def _block(path: Path, title: str) -> bytes:
 def written_with_checksum(path: Path, title: str) -> Iterator[h5py.File]:
     """A new HDF5 file, which appears under its name with its checksum only when it is complete."""
     partial = path.with_name(path.name + ".partial")
-    with h5py.File(partial, "w", userblock_size=BLOCK) as file:
+    with written_hdf5(partial, userblock_size=BLOCK) as file:
         yield file
-    write_checksum(partial, title)
-    os.replace(partial, path)
+    with removed_on_failure(partial):
+        write_checksum(partial, title)
+        os.replace(partial, path)
 
 
 def write_checksum(path: Path, title: str) -> None:

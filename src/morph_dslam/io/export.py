@@ -24,11 +24,11 @@ from tqdm import tqdm
 
 from morph_dslam.errors import ExportError, StudyError
 from morph_dslam.io.gltf import GENERATOR, Colours, write_glb
-from morph_dslam.io.text import read_csv
+from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import Parameter, ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.shown_field import shown_field
-from morph_dslam.units import read_quantity, to_si
+from morph_dslam.units import FACTORS, read_quantity, to_si
 
 Array = NDArray[np.float64]
 FileFormat = Literal["xdmf", "vtu", "gltf"]
@@ -113,47 +113,76 @@ def read_path(model: ReducedModel, path: Path, base: Array) -> Array:
     """The states (s, d) in the rows of a CSV table.
 
     A column is headed "name [unit]", as in the table of an export, or "name_unit", as in the ``frames.csv``
-    of a run. Other columns are passed over, and so are rows without values: frames that were not tracked.
-    Parameters without a column keep their value in ``base``.
+    of a run; the unit is any of the parameter's quantity. Other columns are passed over, and so are rows without
+    values: frames that were not tracked. Parameters without a column keep their value in ``base``.
+
+    Raises
+    ------
+    ExportError
+        If the table cannot be read, a parameter's column has no unit, another quantity's, or a twin, no column is a
+        parameter's, or a value is no number in the range.
     """
     if not model.parameters:
         raise ExportError(f"'{model.name}' has no parameters, and so one state only: leave --path out")
     (_, header), *rows = read_csv(path, "path", ExportError) or [(1, [])]
-    columns = {}
-    for k, p in enumerate(model.parameters):
-        found = [column for column, name in enumerate(header) if name in (f"{p.name} [{p.unit}]", f"{p.name}_{p.unit}")]
-        if len(found) > 1:
-            titles = " and ".join(f"'{header[column]}'" for column in found)
-            raise ExportError(f"{path}: the columns {titles} both hold '{p.name}': leave one of them in")
-        if found:
-            columns[k] = found[0]
+    found = {k: _column_of(p, header, path) for k, p in enumerate(model.parameters)}
+    columns = {k: column for k, column in found.items() if column is not None}
     if not columns:
         wanted = ", ".join(f"'{p.name} [{p.unit}]'" for p in model.parameters)
         raise ExportError(f"{path} has no column of a parameter; name the columns {wanted}")
     states = []
     for line, row in rows:
-        texts = {k: row[column] if column < len(row) else "" for k, column in columns.items()}
+        texts = {k: row[column] if column < len(row) else "" for k, (column, _) in columns.items()}
         if not all(texts.values()):
             continue
         mu = base.copy()
         for k, text in texts.items():
-            mu[k] = _number(model.parameters[k], text, f"{path}, line {line}")
+            mu[k] = _number(model.parameters[k], text, f"{path}, line {line}", columns[k][1])
         states.append(mu)
     if not 0 < len(states) <= MOST_STATES:
         raise ExportError(f"{path} holds {len(states)} states, and 1 to {MOST_STATES} can be exported")
     return np.array(states)
 
 
-def _number(parameter: Parameter, text: str, where: str) -> float:
-    """A value in the parameter's unit, or with another unit behind it, as SI."""
+def _column_of(parameter: Parameter, header: Sequence[str], path: Path) -> tuple[int, str] | None:
+    """The column that holds a parameter, and its unit; None if there is none.
+
+    A title in the parameter's own unit goes before "name" alone and "name_unit" in another one: a parameter may be
+    called as one of the columns of ``frames.csv`` ("time" as ``time_ms``).
+    """
+    units, all_units = FACTORS[parameter.quantity], {unit for known in FACTORS.values() for unit in known}
+    found, wrong = dict[int, str](), []
+    for column, title in enumerate(header):
+        name, unit = name_and_unit(title)
+        if name == parameter.name and unit in units:
+            found[column] = unit
+        elif title == parameter.name or (name == parameter.name and (title.endswith("]") or unit in all_units)):
+            wrong.append(title)
+    if parameter.unit in found.values():
+        found = {k: unit for k, unit in found.items() if unit == parameter.unit or header[k].endswith("]")}
+        wrong = [title for title in wrong if title.endswith("]")]
+    if wrong:
+        raise ExportError(
+            f"{path}: the column '{wrong[0]}' has no unit of '{parameter.name}': name it "
+            f"'{parameter.name} [{parameter.unit}]', or with another unit of {parameter.quantity} ({', '.join(units)})"
+        )
+    if len(found) > 1:
+        titles = " and ".join(f"'{header[column]}'" for column in found)
+        raise ExportError(f"{path}: the columns {titles} both hold '{parameter.name}': leave one of them in")
+    return next(iter(found.items()), None)
+
+
+def _number(parameter: Parameter, text: str, where: str, unit: str = "") -> float:
+    """A value in the parameter's unit or ``unit``, or with another unit behind it, as SI."""
+    unit = unit or parameter.unit
     try:
-        value = to_si(float(text), parameter.unit, parameter.quantity)
+        value = to_si(float(text), unit, parameter.quantity)
     except ValueError:
         try:
             value = read_quantity(text, parameter.quantity)
         except StudyError as error:
             raise ExportError(
-                f"{where}: '{text}' is not a value of {parameter.name}: write a number in {parameter.unit}, or with "
+                f"{where}: '{text}' is not a value of {parameter.name}: write a number in {unit}, or with "
                 f"another unit: {error}"
             ) from None
     return _in_range(parameter, value, where)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from morph_dslam.errors import TrackingError
@@ -71,6 +71,8 @@ def only_writer(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        with suppress(OSError):
+            fcntl.flock(opened, fcntl.LOCK_UN)  # processes forked meanwhile hold the folder open too
         os.close(opened)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from morph_dslam.errors import MorphError
 
+_BRACKETED = re.compile(r"(.*\S)\s*\[(.+)\]")
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 
@@ -49,6 +51,14 @@ def read_csv(path: Path, what: str, error_class: type[MorphError]) -> list[tuple
         if rows and separator in rows[0][1][0]:
             raise error_class(f"{path} is separated by {name}: write commas between cells, and decimals with points")
     return rows
+
+
+def name_and_unit(header: str) -> tuple[str, str]:
+    """Both parts of a column's header, "stroke_mm" or "stroke [mm]"."""
+    if bracketed := _BRACKETED.fullmatch(header):
+        return bracketed[1], bracketed[2]
+    name, _, unit = header.rpartition("_")
+    return name, unit
 
 
 def read_toml(path: Path, what: str, error_class: type[MorphError]) -> dict[str, Any]:

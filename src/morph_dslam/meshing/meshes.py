@@ -203,8 +203,16 @@ def model_mesh_of(mesh: Mesh) -> ModelMesh:
         nodes=mesh.nodes,
         triangles=mesh.surface_triangles(),
         weights=lumped_weights(mesh),
-        cells={block.cell_type: block.connectivity for block in mesh.blocks} if solid else {},
+        cells=cells_by_type(mesh) if solid else {},
     )
+
+
+def cells_by_type(mesh: Mesh) -> dict[str, Indices]:
+    """Connectivity (m, k) of all cells of each type, block after block, by the name of the type."""
+    found: dict[str, list[Indices]] = {}
+    for block in mesh.blocks:
+        found.setdefault(block.cell_type, []).append(block.connectivity)
+    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 def lumped_weights(mesh: Mesh) -> Array:

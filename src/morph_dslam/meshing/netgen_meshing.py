@@ -33,6 +33,8 @@ Indices = NDArray[np.int64]
 SURFACES = (".stl", ".obj", ".ply")
 #: More cells than anyone solves on: their size is a mistake, and meshing them would take for ever.
 MOST_CELLS = 10_000_000
+#: Solids overlap if they have more than this share of their volume in common; less is rounding.
+OVERLAP = 1e-6
 #: No header of a .ply file has more.
 MOST_HEADER_LINES = 10_000
 
@@ -264,8 +266,8 @@ def _meshed_anew(surface: _TriangleSurface, size: float) -> Any:
 def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
     """Mesh the solids of a STEP file with tetrahedra; in millimetres, which the STEP reader converts to.
 
-    Raises StudyError if the file cannot be read or states another unit, its solids cannot be meshed, or the size of
-    cells goes with no body of their extent.
+    Solids that touch share the nodes where they do. Raises StudyError if the file cannot be read or states another
+    unit, its solids overlap or cannot be meshed, or the size of cells goes with no body of their extent.
 
     Parameters
     ----------
@@ -285,7 +287,7 @@ def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
         named = Path(folder) / "solids.step"  # Netgen goes by the name
         named.symlink_to(path.resolve())
         try:
-            geometry = occ.OCCGeometry(str(named))
+            geometry = _joined(occ.OCCGeometry(str(named)), path)
             low, high = geometry.shape.bounding_box
             extent = np.array([high[i] - low[i] for i in range(3)])
             if size is not None:
@@ -297,3 +299,18 @@ def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
         except Exception as error:  # Netgen and Open CASCADE raise plain Exception
             raise StudyError(f"Netgen could not mesh the solids of {path}: {error}") from error
     return _volume_mesh(content, path)
+
+
+def _joined(geometry: Any, path: Path) -> Any:
+    """The geometry with one face where two solids touch, which else has two; StudyError if solids overlap."""
+    solids = list(geometry.shape.solids)
+    if len(solids) < 2:
+        return geometry
+    shape = occ.Glue(solids)
+    volume = sum(solid.mass for solid in solids)
+    if shape.mass < (1.0 - OVERLAP) * volume:
+        raise StudyError(
+            f"the {len(solids)} solids of {path} overlap by {volume - shape.mass:.3g} mm3, and no material is known "
+            "there: cut one out of the other in the modelling program"
+        )
+    return occ.OCCGeometry(shape)

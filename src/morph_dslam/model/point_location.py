@@ -123,7 +123,7 @@ class _Search:
             size = connectivity.shape[1]
             corners[rows, :size] = connectivity[self._cells[rows] - start]
             weights[rows, :size] = kind.shape_functions(self._reference[rows])
-        return MaterialPoints(corners, weights)
+        return MaterialPoints(corners, weights, np.einsum("pc,pcx->px", weights, self._nodes[corners]))
 
 
 def _outside_by(shape: str, reference: Array) -> Array:

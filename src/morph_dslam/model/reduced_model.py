@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.errors import ParameterError, StudyError
-from morph_dslam.model.separated import Outside, SeparatedField
+from morph_dslam.model.separated import Outside, SeparatedField, check_outside
 from morph_dslam.model.unknown_loads import ElasticEnergy, UnknownLoads
 from morph_dslam.units import from_si, read_quantity
 
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 ParameterValues = ArrayLike | Mapping[str, float | str]
 #: Values may pass the end of a range by so much of its width: tables round.
 ROUNDING = 1e-6
+#: Meshes are the same if their nodes differ by less than this share of their coordinates: files round.
+SAME_PLACE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -99,10 +101,13 @@ class MaterialPoints:
     ----------
     corners : (p, c) node indices.
     weights : (p, c), the shape functions of those nodes at the points.
+    places : (p, 3) where they lie in the undeformed shape, metres: a model that has them elsewhere refuses them. None
+        where only one model can be meant.
     """
 
     corners: NDArray[np.int64]
     weights: Array
+    places: Array | None = None
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -249,7 +254,8 @@ class ReducedModel:
         Raises
         ------
         ParameterError
-            If there is no such parameter, or a value is not finite, not readable, or outside of its range.
+            If there is no such parameter, a value is not finite, not readable, or outside of its range, or ``outside``
+            is another word.
         """
         mu = self.vector(parameters)
         for p, value in zip(self.parameters, mu, strict=True):
@@ -355,10 +361,24 @@ class ReducedModel:
     def _interpolation(self, points: Points) -> tuple[NDArray[np.int64], Array]:
         if isinstance(points, SurfacePoints):
             return self.triangles[points.triangles], points.weights
+        if points.places is not None:
+            self._check_places(points, points.places)
         return points.corners, points.weights
 
+    def _check_places(self, points: MaterialPoints, places: Array) -> None:
+        """Raise ParameterError if the points lie elsewhere in this mesh: they are another model's."""
+        if points.corners.max(initial=0) < len(self.nodes):
+            nodes = self.nodes[points.corners]
+            here = np.einsum("pc,pcx->px", points.weights, nodes)
+            if np.abs(here - places).max(initial=0.0) <= SAME_PLACE * np.abs(nodes).max(initial=0.0):
+                return
+        raise ParameterError(
+            f"these points were found in a model with another mesh than '{self.name}': find them in this one, with its "
+            "method points(positions)"
+        )
+
     def rest_positions(self, points: Points) -> Array:
-        """Undeformed positions (p, 3) of points, metres."""
+        """Undeformed positions (p, 3) of points, metres; ParameterError if they are another model's."""
         corners, weights = self._interpolation(points)
         return np.einsum("pc,pcx->px", weights, self.nodes[corners])
 
@@ -370,7 +390,7 @@ class ReducedModel:
         Raises
         ------
         ParameterError
-            If the model has no such field.
+            If the model has no such field, or the points were found in a model with another mesh.
         """
         return self.field(name).restrict(*self._interpolation(points), precision)
 
@@ -392,7 +412,8 @@ class ReducedModel:
 class DeformedState:
     """A reduced model at given parameters; object frame.
 
-    Fields are given at the mesh's nodes, or at points of `ReducedModel.points`: n is the number of either.
+    Fields are given at the mesh's nodes, or at points of `ReducedModel.points`: n is the number of either. Points that
+    were found in a model with another mesh are refused (ParameterError).
 
     Attributes
     ----------
@@ -404,6 +425,9 @@ class DeformedState:
     model: ReducedModel
     parameters: Array
     outside: Outside = "bounded"
+
+    def __post_init__(self) -> None:
+        check_outside(self.outside)
 
     def displacement(self, points: Points | None = None) -> Array:
         """(n, 3), metres."""

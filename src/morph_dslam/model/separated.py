@@ -9,12 +9,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from morph_dslam.errors import ParameterError
 from morph_dslam.model.functions import Functions
 
 Array = NDArray[np.float64]
 #: What a field is outside the box of its parameters. "bounded": that of the nearest state in the box;
 #: "linear": continued from there by its tangents (C1, linear in each parameter), see `SeparatedField.inside`.
 Outside = Literal["bounded", "linear"]
+
+
+def check_outside(outside: str) -> None:
+    """Raise ParameterError unless it says what a field is outside of the box."""
+    if outside not in ("bounded", "linear"):
+        raise ParameterError(f"outside={outside!r} is not known: give 'bounded' or 'linear'")
 
 
 @njit(cache=True, nogil=True)
@@ -128,11 +135,8 @@ class SeparatedField:
         return self.functions.inside(mu)
 
     def _state(self, mu: ArrayLike, outside: Outside) -> ArrayLike:
-        if outside == "linear":
-            return mu
-        if outside == "bounded":
-            return self.functions.nearest_inside(mu)
-        raise ValueError(f"outside the box a field is 'bounded' or 'linear', not '{outside}'")
+        check_outside(outside)
+        return mu if outside == "linear" else self.functions.nearest_inside(mu)
 
     def value(self, mu: ArrayLike, outside: Outside = "bounded") -> Array:
         """The field (n_points, n_components) at parameters ``mu`` (d,)."""

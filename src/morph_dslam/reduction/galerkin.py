@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.continuation import advance
-from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, in_contact, solve
+from morph_dslam.mechanics.solvers.continuation import PathError, advance
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, in_contact, solve, where
 from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import fit_functions
 from morph_dslam.studies.problem import SweepProblem
@@ -100,6 +100,10 @@ class GalerkinEquations:
     def coefficients(self, x: Array, weights: Array | None = None) -> Array:
         """Coefficients (k,) of a full solution (n,): its projection, for modes orthonormal in ``weights``."""
         return self.modes @ (x if weights is None else weights * x)
+
+    def state_text(self, mu: Array) -> str:
+        """A state (d,) for messages."""
+        return where(self.full, mu)
 
     def prescribed(self, mu: Array) -> Array:
         return np.zeros(self.n_dofs)
@@ -229,7 +233,7 @@ class ReducedSolver:
         self._next_fit = REFIT * comb(len(box) + 3, 3)
 
     def solve(self, mu: Array) -> Array:
-        """Coefficients (k,) of the modes at ``mu`` (d,)."""
+        """Coefficients (k,) of the modes at ``mu`` (d,); SolverError if there is no solution."""
         nearest = self._nearest(np.array(self._samples), mu)
         predicted, _ = self._prediction.evaluate(mu)
         start = predicted + self._values[nearest] - self._prediction.evaluate(self._samples[nearest])[0]
@@ -262,7 +266,14 @@ class ReducedSolver:
         except SolverError:
             nearest = self._nearest(self._solutions.samples, mu)
             state = State(self._solutions.samples[nearest], self._known[nearest])
+        try:
             return advance(self.galerkin, state, mu)[-1].dofs
+        except PathError as error:
+            reached = where(self.galerkin, error.states[-1].mu)
+            raise SolverError(
+                f"the equations projected on {self.galerkin.n_dofs} modes could not be solved at "
+                f"{where(self.galerkin, mu)}, nor beyond {reached} on the way there"
+            ) from error
 
     def lift(self, y: Array, mu: Array) -> Array:
         """Full state (n_dofs,) of coefficients ``y``."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import ArgumentError, StudyError
 
 if TYPE_CHECKING:
     from morph_dslam.model import ReducedModel
@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 Reduce = Callable[["ReductionTask"], "ReducedModel"]
 #: For a number of parameters, the names of formats and of bases that a method has, its default first.
 OfferedFunctions = Callable[[int], tuple[tuple[str, ...], tuple[str, ...]]]
-#: Modules that register the built-in methods.
-_BUILT_IN = ("galerkin_method", "pod_method", "sparse_pgd")
+#: Modules that register the built-in methods, by name.
+_BUILT_IN = {
+    "galerkin": "morph_dslam.reduction.galerkin_method",
+    "reduced_basis": "morph_dslam.reduction.galerkin_method",
+    "pod": "morph_dslam.reduction.pod_method",
+    "sparse_pgd": "morph_dslam.reduction.sparse_pgd",
+}
 
 
 @dataclass(frozen=True)
@@ -54,21 +59,28 @@ _methods: dict[str, ReductionMethod] = {}
 
 
 def register_reduction(name: str, reduce: Reduce, **properties: Any) -> None:
-    """Make a method of reduction known to study files, or replace the one of this name.
+    """Make a method of reduction known to study files, or replace one of your own.
 
     Parameters
     ----------
     name : as ``[reduction] method`` names it.
     reduce : makes a reduced model from a `ReductionTask`.
     properties : other attributes of `ReductionMethod`.
+
+    Raises
+    ------
+    ArgumentError
+        If a built-in method has this name.
     """
+    if name in _BUILT_IN and getattr(reduce, "__module__", None) != _BUILT_IN[name]:
+        raise ArgumentError(f"'{name}' is a built-in method of reduction: register yours by another name")
     _methods[name] = ReductionMethod(name, reduce, **properties)
 
 
 def reduction_methods() -> dict[str, ReductionMethod]:
     """All methods known, by name."""
-    for module in _BUILT_IN:
-        import_module(f"morph_dslam.reduction.{module}")
+    for module in dict.fromkeys(_BUILT_IN.values()):
+        import_module(module)
     return _methods
 
 

@@ -87,7 +87,18 @@ class ReductionTask:
         return self.mesh.weights if n_points == len(self.mesh.weights) else np.ones(n_points)
 
     def model(self, fields: Mapping[str, SeparatedField], summary: dict[str, Any]) -> ReducedModel:
-        """The reduced model of separated fields by name, with what the method says of itself."""
+        """The reduced model of separated fields by name, with what the method says of itself.
+
+        Raises
+        ------
+        StudyError
+            If the displacement is not among the fields.
+        """
+        if "displacement" not in fields:
+            raise StudyError(
+                f"the fields of a reduced model are {', '.join(fields) or 'none'}: give those of task.field_names, "
+                "'displacement' among them"
+            )
         return ReducedModel(
             name=self.name,
             nodes=self.mesh.nodes,

@@ -9,7 +9,7 @@ row's instant. Depth is that of an ideal pinhole's image.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +22,10 @@ from tqdm import tqdm
 from morph_dslam.camera import Camera
 from morph_dslam.errors import SceneError
 from morph_dslam.io.camera_files import load_camera, parse_camera, save_camera
+from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.io.writing import removed_on_failure, writing
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.render.environment import VALUES_PER_METRE, Motion, StaticScene, plan_motion, sensor_depth
@@ -177,13 +179,11 @@ def _surroundings(scene: Scene, folder: Path, camera: Camera, motion: Motion) ->
 def _prepare_folder(output: Path) -> None:
     """Make the folders, and clear frames of an earlier simulation, which would mix with the new ones."""
     for folder in (output / "frames", output / "depth"):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SceneError(f"cannot write the sequence to {output}: {error.strerror}") from error
+        folder.mkdir(parents=True, exist_ok=True)
     try:
-        h5py.File(output / "depth.h5", "w").close()  # HDF5 locks it while it is written
-    except OSError as error:
+        with written_hdf5(output / "depth.h5"):
+            pass
+    except BlockingIOError as error:
         raise SceneError(
             f"cannot write {output / 'depth.h5'}: is another simulation writing to this folder, or another "
             "program reading the file? Name another folder, or wait for it"
@@ -258,9 +258,8 @@ def _create_depth(file: h5py.File, world: _World) -> h5py.Dataset:
     return dataset
 
 
-def _write_image(path: Path, image: NDArray[np.uint8], quality: int) -> None:
-    options = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, quality], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 3]}
-    if not cv2.imwrite(str(path), image, options[path.suffix]):
+def _write_image(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16], options: Sequence[int] = ()) -> None:
+    if not cv2.imwrite(str(path), image, options):
         raise SceneError(f"cannot write {path}: is the disk full?")
 
 
@@ -270,13 +269,14 @@ def _render_frames(
     """Write all images and depths; says which truth points (T, p) are visible."""
     scene, camera = world.scene, world.camera
     columns, rows = pixel_axes(camera.height, camera.width)
+    jpg, png = [cv2.IMWRITE_JPEG_QUALITY, scene.jpeg_quality], [cv2.IMWRITE_PNG_COMPRESSION, 3]
     visible = np.zeros(truth.shape[:2], dtype=bool)
-    with h5py.File(output / "depth.h5", "w") as file:
+    with written_hdf5(output / "depth.h5") as file:
         depths = _create_depth(file, world)
         for frame in tqdm(range(scene.frames), desc="rendering", unit="frame", disable=not progress):
             nodes = world.node_positions(frame)
             path = output / "frames" / f"{frame:06}.{scene.image_format}"
-            _write_image(path, world.image(frame, renderer), scene.jpeg_quality)
+            _write_image(path, world.image(frame, renderer), jpg if path.suffix == ".jpg" else png)
             depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)
             both, occluded = np.minimum(depth, behind), world.occluded(frame, columns, rows)
             visible[frame] = world.visible(frame, truth[frame], both)
@@ -284,7 +284,7 @@ def _render_frames(
             depths[frame] = np.where(hidden, np.float32(0.0), depth)
             measured = world.measured_depth(frame, both, occluded)
             if measured is not None:
-                cv2.imwrite(str(output / "depth" / f"{frame:06}.png"), measured)
+                _write_image(output / "depth" / f"{frame:06}.png", measured)
     return visible
 
 
@@ -361,16 +361,19 @@ def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) 
     Raises
     ------
     SceneError
-        If the scene file is wrong, or the motion it prescribes leaves the model's range or the camera's view.
+        If the scene file is wrong, the motion it prescribes leaves the model's range or the camera's view, or the
+        folder cannot be written to.
     CameraError, ModelFileError
         If the camera or the model that it names cannot be read.
     """
     world = _load_world(Path(scene_path))
     renderer, output = world.renderer(), Path(output)
-    _prepare_folder(output)
-    save_camera(output / "camera.yaml", world.camera)
-    save_landmarks(output / "landmarks.csv", _landmarks(world))
-    truth = _truth_positions(world, _truth_points(world.model))
-    visible = _render_frames(world, renderer, output, truth, progress)
-    _write_truth(output / "truth.npz", world, truth, visible)
-    _write_lists(output, world)
+    with writing(SceneError, output):
+        _prepare_folder(output)
+        save_camera(output / "camera.yaml", world.camera)
+        save_landmarks(output / "landmarks.csv", _landmarks(world))
+        truth = _truth_positions(world, _truth_points(world.model))
+        visible = _render_frames(world, renderer, output, truth, progress)
+        with removed_on_failure(output / "truth.npz"):
+            _write_truth(output / "truth.npz", world, truth, visible)
+        _write_lists(output, world)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.errors import SceneError, SourceError
+from morph_dslam.errors import SceneError, SourceError, how_to_install
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.model.reduced_model import triangle_normals
@@ -42,8 +42,8 @@ def find_photograph(name: str, folder: Path) -> Path:
     packaged = _packaged_folder()
     if packaged is None:
         raise SceneError(
-            f"'{name}' is a photograph packaged with scikit-image, which is not installed: "
-            'pip install "morph-dslam[demo]", or name an image file'
+            f"'{name}' is a photograph packaged with scikit-image, which is not installed: {how_to_install('demo')}, "
+            "or name an image file"
         )
     files = {file.stem: file for file in sorted(packaged.glob("*.png")) + sorted(packaged.glob("*.jpg"))}
     if name not in files:

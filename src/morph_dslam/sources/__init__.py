@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 from morph_dslam.errors import SourceError, check_kind
-from morph_dslam.sources.frames import Frame, FrameSource, FrameStream
+from morph_dslam.sources.frames import CheckedSource, CheckedStream, Frame, FrameSource, FrameStream
 from morph_dslam.sources.live import LiveStream, PacedRecording, is_camera, open_camera
 from morph_dslam.sources.local_socket import open_socket
 from morph_dslam.sources.recorded import (
@@ -29,7 +29,7 @@ _KINDS: list[tuple[Matches, Open]] = []
 
 
 def register_source(matches: Matches, open: Open) -> None:
-    """Add a kind of source, which every command and `open_source` then accept.
+    """Add a kind of source, which `open_source`, and all else in the program that calls this, then accept.
 
     Parameters
     ----------
@@ -54,10 +54,23 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
         raise SourceError(f"frames {first}-{last} of {path}: the last frame is before the first")
     for matches, open_kind in _KINDS:
         if matches(path):
-            return open_kind(path, first, last)
+            return _checked(open_kind(path, first, last), path)
     raise SourceError(
         f"there is no folder of images and no video at {path} (cameras are webcam:0, /dev/video0 or a URL)"
     )
+
+
+def _checked(stream: FrameStream, path: Path) -> FrameStream:
+    """What a kind of source has opened; SourceError unless it is a source, also of its frames as they come."""
+    if isinstance(stream, LiveStream):
+        return stream
+    missing = [name for name in ("name", "fps", "__iter__") if getattr(stream, name, None) is None]
+    if missing:
+        raise SourceError(
+            f"what was registered for {path} opens it as an object of type {type(stream).__name__}, without "
+            f"{missing[0]}: return one with name, fps and __iter__"
+        )
+    return CheckedSource(stream) if isinstance(stream, FrameSource) else CheckedStream(stream)
 
 
 def open_source(path: str | Path, first: int | None = None, last: int | None = None) -> FrameSource:
@@ -77,7 +90,8 @@ def open_source(path: str | Path, first: int | None = None, last: int | None = N
     if isinstance(stream, LiveStream):
         stream.close()
         raise SourceError(f"{path} is live; a recording is needed here")
-    assert isinstance(stream, FrameSource)
+    if not isinstance(stream, FrameSource):
+        raise SourceError(f"{path} has no length, and a recording is needed here: give what opens it a method __len__")
     return stream
 
 

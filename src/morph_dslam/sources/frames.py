@@ -64,6 +64,47 @@ class FrameSource(FrameStream, Protocol):
         ...
 
 
+def check_frame(frame: object, before: Frame | None, source: str) -> None:
+    """Raise SourceError unless a source gives a frame, with a larger number than the frame before it."""
+    after = "at first" if before is None else f"after frame {before.index}"
+    if not isinstance(frame, Frame):
+        raise SourceError(f"{source} gives an object of type {type(frame).__name__} {after}: give md.Frame objects")
+    if before is not None and not frame.index > before.index:
+        raise SourceError(f"{source} gives frame {frame.index} {after}: number frames in the order in which they come")
+
+
+class CheckedStream:
+    """The frames of a source, each checked as it comes; all else is the source's own.
+
+    Attributes
+    ----------
+    name : of the source.
+    fps : frames per second.
+    """
+
+    def __init__(self, stream: FrameStream) -> None:
+        self._stream, self.name, self.fps = stream, stream.name, stream.fps
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def __iter__(self) -> Iterator[Frame]:
+        before = None
+        for frame in self._stream:
+            check_frame(frame, before, self.name)
+            before = frame
+            yield frame
+
+
+class CheckedSource(CheckedStream):
+    """That of a recording, which has a length."""
+
+    _stream: FrameSource
+
+    def __len__(self) -> int:
+        return len(self._stream)
+
+
 def has_registered_depth(source: FrameStream) -> bool:
     """Whether frames come with depth that belongs to their pixels."""
     return bool(getattr(source, "has_registered_depth", False))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import SourceError, how_to_install
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.sources.frames import Frame, check_range, check_size
 
@@ -58,7 +58,7 @@ def _reader(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise SourceError(f'{path} is a ROS bag, which needs rosbags: pip install "morph-dslam[ros]"') from error
+        raise SourceError(f"{path} is a ROS bag, which needs rosbags: {how_to_install('ros')}") from error
     # ROS 2 bags are folders; older ones do not carry the definitions of their messages.
     folder = path.parent if file_kind(path) in (".db3", ".mcap") and (path.parent / "metadata.yaml").is_file() else path
     try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from morph_dslam.errors import StreamError
+from morph_dslam.errors import StreamError, how_to_install
 from morph_dslam.io.access import HOST
 from morph_dslam.streams.messages import Publisher
 
@@ -83,8 +83,8 @@ class _Kind:
 
 _ROS_MISSING = "install ROS 2, `source /opt/ros/DISTRIBUTION/setup.bash`, and start `morph` there"
 _KINDS: dict[str, _Kind] = {
-    "ws": _Kind("websockets", "pip install 'morph-dslam[stream]'", _address, _open_websocket),
-    "rerun": _Kind("rerun", "pip install 'morph-dslam[rerun]'", _recording, _open_rerun),
+    "ws": _Kind("websockets", how_to_install("stream"), _address, _open_websocket),
+    "rerun": _Kind("rerun", how_to_install("rerun"), _recording, _open_rerun),
     "ros2": _Kind("rclpy", _ROS_MISSING, _prefix, _open_ros2),
 }
 

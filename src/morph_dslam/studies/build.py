@@ -12,15 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.geometry import fit_similarity
+from morph_dslam.io.writing import writing
 from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
 from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
-from morph_dslam.reduction.registry import reduction_method
+from morph_dslam.reduction.registry import ReductionMethod, reduction_method
 from morph_dslam.reduction.self_penetration import obstacle_report, penetration_report
 from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.defaults import resolve_defaults
@@ -60,6 +61,12 @@ UNSURE_LOADS = (
     "responses to unknown loads are off by {:.0f} % between the states where they are known: narrow the ranges of the "
     "parameters"
 )
+#: The method that needs no solutions of reduced equations.
+FALLBACK = "pod"
+UNSOLVED_REDUCTION = (
+    'method "{}" failed: {}. Use reduction.method = "pod", take more samples (sampling.first, sampling.training), or '
+    "narrow the ranges of the parameters"
+)
 DOUBTFUL = (
     "the model misses {} at held-out solutions: do not rely on what it says of these; take more samples, or narrow the "
     "ranges of the parameters"
@@ -80,13 +87,18 @@ def build(
     ----------
     study : a study, its file, or the folder of a file study.toml.
     output : the model file to write; None to keep neither it nor the solutions.
-    workers : processes to solve in, the study's own number if absent.
+    workers : processes to solve in, from 1 on; the study's own number if absent. A script that itself defines a law,
+        or another part of the study, builds with several under ``if __name__ == "__main__":``.
     executor : what to solve on in their place: any that runs tasks in processes, a Dask client's say.
 
     Raises
     ------
     StudyError
-        If the study is wrong or too few samples converge.
+        If the study is wrong, too few samples converge, or a file cannot be written.
+    WorkerError
+        If worker processes cannot start, or one dies.
+    ArgumentError
+        If ``workers`` is no whole number from 1 on.
     """
     if output is None:
         with TemporaryDirectory() as folder:
@@ -111,7 +123,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         _announce_mesh(chosen)
     snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
     _check_held_out(chosen, snapshots, output)
-    model = certified_model(snapshots, chosen.reduction, chosen.name)
+    model = certified_model(snapshots, chosen.reduction, chosen.name, _fallback(study.reduction))
     if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
         solutions = [*(group[0] for group in snapshots.training), *snapshots.held_out]
         model.certificate["obstacle_penetration"] = obstacle_report(snapshots.mesh, solutions, *chosen.obstacles())
@@ -124,7 +136,8 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     doubts = _unstrained(snapshots) or _doubtful(model)
     if found := [*_unresolved(chosen, snapshots), *study_warnings(chosen), *doubts]:
         model.certificate["warnings"] = found
-    save_model(output, model)
+    with writing(StudyError, output):
+        save_model(output, model)
     return model
 
 
@@ -243,21 +256,29 @@ def _check_held_out(study: Study, snapshots: Snapshots, output: Path) -> None:
     )
 
 
-def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) -> ReducedModel:
+def certified_model(
+    snapshots: Snapshots, options: ReductionSection, name: str, fallback: str | None = None
+) -> ReducedModel:
     """The reduced model of the training solutions, with its errors at the held-out ones.
+
+    Parameters
+    ----------
+    snapshots : training and held-out solutions.
+    options : how to reduce them.
+    name : of the model.
+    fallback : method in place of one whose reduced equations cannot be solved; None if there shall be no other.
 
     Raises
     ------
     StudyError
-        If the method does not suit the solutions.
+        If the method does not suit the solutions, or what it returns is not their model.
     """
     training, held_out = snapshots.training, snapshots.held_out
     method = reduction_method(options.method or "pod")
     task = ReductionTask(
         snapshots.mesh, snapshots.parameters, training, options, name, snapshots.problem, snapshots.training_files
     )
-    announce(f"reducing {len(training)} solutions by method {method.name}")
-    model = method.reduce(task)
+    model, method = _reduced(task, method, fallback)
     announce(f"measuring errors at {len(held_out)} held-out solutions")
     model.certificate.update(certify(model, held_out))
     model.certificate["compression_percent"] = compression_percent(model, len(training) + len(held_out))
@@ -271,6 +292,49 @@ def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) 
     )
     if penetration is not None:
         model.certificate["self_penetration"] = penetration
+    return model
+
+
+def _fallback(asked: ReductionSection) -> str | None:
+    """The method that may stand in for the default one; None if the study asks for a method or for functions."""
+    return FALLBACK if asked.method is asked.format is asked.basis is None else None
+
+
+def _reduced(
+    task: ReductionTask, method: ReductionMethod, fallback: str | None
+) -> tuple[ReducedModel, ReductionMethod]:
+    """The model of a task and the method that has made it (`certified_model`)."""
+    announce(f"reducing {len(task.groups)} solutions by method {method.name}")
+    try:
+        return _checked(method.reduce(task), task, method.name), method
+    except SolverError as error:
+        if fallback is None:
+            raise StudyError(UNSOLVED_REDUCTION.format(method.name, error)) from error
+        reason = f'method "{method.name}" failed, "{fallback}" took its place: {error}'
+    announce(reason)
+    other = replace(task, options=task.options.model_copy(update={"method": fallback}))
+    model, method = _reduced(other, reduction_method(fallback), None)
+    summary = model.certificate["reduction"]
+    summary["warnings"] = [*summary.get("warnings", []), reason]
+    return model, method
+
+
+def _checked(model: object, task: ReductionTask, method: str) -> ReducedModel:
+    """What a method of reduction returned; StudyError unless it is a model with fields like those of the solutions."""
+    said = f"the method of reduction '{method}' returned"
+    if not isinstance(model, ReducedModel):
+        raise StudyError(f"{said} an object of type {type(model).__name__}: return task.model(fields, summary)")
+    solution = task.snapshots[0]
+    for name, field in model.fields.items():
+        values, solved = field.value(solution.coordinates), solution.fields.get(name)
+        if solved is not None and values.shape != solved.shape:
+            sizes = ", ".join(map(str, solved.shape))
+            raise StudyError(
+                f"{said} the field '{name}' of shape {values.shape}, and that of a solution is ({sizes}): give modes "
+                f"of shape (n_modes, {sizes})"
+            )
+        if not (np.isfinite(values).all() and np.isfinite(field.modes).all()):
+            raise StudyError(f"{said} the field '{name}' with values that are not finite: check modes and functions")
     return model
 
 

@@ -27,6 +27,7 @@ from morph_dslam.mechanics.solvers.linear_solver import SolverMaker
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
 from morph_dslam.mechanics.solvers.two_level import LowerOrder, TwoLevelSolver
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.parameter_errors import ENTRY, parameter_errors
 from morph_dslam.model.reduced_model import REACTION
 from morph_dslam.reduction.certificate import field_errors
 from morph_dslam.studies.external import ExternalStudy
@@ -92,7 +93,8 @@ def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedMode
     dict
         "method"; "unknowns" of the study's solid and of the finer one; "coordinates" of the states; "errors" of the
         held-out solutions against the finer ones by field, at the nodes of the model (`certificate.field_errors`);
-        "left_out", why some states are missing. Or only "not_estimated", the reason.
+        "parameters", what they amount to in these (`parameter_errors`); "left_out", why some states are missing. Or
+        only "not_estimated", the reason.
     """
     try:
         return _estimate(_refinable(study), snapshots, model, seconds)
@@ -356,6 +358,7 @@ def _figures(
         (snapshots.held_out[index], with_reactions(_snapshot(finer, state), reactions))
         for index, state in sorted(solved.items())
     ]
+    shapes = [(own.coordinates, own.fields["displacement"], truth.fields["displacement"]) for own, truth in pairs]
     return {
         "method": f"displacements of order {finer.displacements.order} on the same cells",
         "unknowns": _unknowns(coarse, finer),
@@ -364,4 +367,5 @@ def _figures(
             name: field_errors(name, [(own.fields[name], truth.fields[name]) for own, truth in pairs])
             for name in model.fields
         },
+        ENTRY: parameter_errors(model, shapes),
     }

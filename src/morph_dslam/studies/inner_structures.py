@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,8 @@ def place_inner_structure(model: ReducedModel, name: str, nodes: Array, triangle
             f"({low}) to ({high}) mm. Is the unit right, and is it drawn in the object's frame?"
         ) from error
     # Shape functions reproduce the positions to rounding; what is kept is what the model says.
-    return InnerStructure(name, model.rest_positions(points), triangles.astype(np.int64), points)
+    rest, points = model.rest_positions(points), replace(points, places=None)  # the structure has them itself
+    return InnerStructure(name, rest, triangles.astype(np.int64), points)
 
 
 def read_inner_structure(model: ReducedModel, name: str, path: Path, unit: str) -> InnerStructure:

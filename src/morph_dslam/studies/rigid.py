@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.writing import writing
 from morph_dslam.meshing.mesh_checks import check_extent, described_extent
 from morph_dslam.meshing.netgen_meshing import read_surface
 from morph_dslam.meshing.surface_repair import refined_surface, repaired_surface
@@ -67,5 +68,6 @@ def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None
         output = Path(output)
         if not output.parent.is_dir():
             raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
-        save_model(output, model)
+        with writing(StudyError, output):
+            save_model(output, model)
     return model

@@ -6,7 +6,6 @@ Nothing is read from or written to a folder here, so workers on other machines n
 from __future__ import annotations
 
 import gc
-import os
 import threading
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError, WorkerError
 from morph_dslam.studies.problem import ParametricStudy, SweepProblem
 from morph_dslam.studies.snapshots import encode_snapshot
+from morph_dslam.threads import usable_cores
 
 Array = NDArray[np.float64]
 #: A problem holds one state at a time; a worker of several threads solves one sample after the other.
@@ -63,10 +63,15 @@ def _problem(study: ParametricStudy, fingerprint: str) -> SweepProblem:
             "a worker has another release of morph-dslam, or other files under the names in the study, than "
             "the build: give all of them the same, or start the build again if either was changed meanwhile"
         )
+    keep_threads(study)
+    return study.sweep_problem()
+
+
+def keep_threads(study: ParametricStudy) -> None:
+    """Assemble in as many threads as the study has, from now on and in this process."""
     import ngsolve
 
-    ngsolve.SetNumThreads(study.work.threads or os.cpu_count() or 1)
-    return study.sweep_problem()
+    ngsolve.SetNumThreads(study.work.threads or usable_cores())
 
 
 def forget_problem() -> None:

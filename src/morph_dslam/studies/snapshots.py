@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import StudyError
+from morph_dslam.io.writing import removed_on_failure, writing
 from morph_dslam.studies.problem import ParametricStudy, Snapshot
 
 Array = NDArray[np.float64]
@@ -57,13 +59,20 @@ def encode_snapshot(snapshot: Snapshot, state: dict[str, Array]) -> bytes:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file that is either there in full or not at all, whenever the program is killed."""
+    """Write a file that is either there in full or not at all, whenever the program is killed.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be written.
+    """
     partial = path.with_suffix(f".{os.getpid()}{PARTIAL}")
-    with partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())  # the name must not reach the disk before the content
-    os.replace(partial, path)
+    with writing(StudyError, path), removed_on_failure(partial):
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())  # the name must not reach the disk before the content
+        os.replace(partial, path)
 
 
 def damage(path: Path) -> str | None:

@@ -6,21 +6,24 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cache
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import ArgumentError
 from morph_dslam.mechanics.loads import reaction_names, with_reactions
 from morph_dslam.model import Parameter
 from morph_dslam.reduction.adaptive_sampling import sample_adaptively
 from morph_dslam.reduction.bisection import sample_by_bisection
 from morph_dslam.reduction.certificate import stability_report
 from morph_dslam.reduction.registry import reduction_method
-from morph_dslam.studies.executors import default_executor
+from morph_dslam.studies.executors import default_executor, needs_main
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.problem import ModelMesh, ParametricStudy, Snapshot, SweepProblem, bounds
+from morph_dslam.studies.sample_task import keep_threads
 from morph_dslam.studies.sampling import held_out_samples, training_samples
 from morph_dslam.studies.snapshots import load_outputs, load_snapshot
 from morph_dslam.studies.study import Study
@@ -70,19 +73,27 @@ def take_snapshots(
     folder : where solutions are kept.
     workers : processes to solve in, the study's own number if absent.
     executor : what to solve on in their place.
+
+    Raises
+    ------
+    ArgumentError
+        If ``workers`` is no whole number from 1 on.
     """
+    if workers is not None and (not isinstance(workers, Integral) or workers < 1):
+        raise ArgumentError(f"workers is {workers!r}: give a number of processes from 1 on, or None for the study's")
     if isinstance(study, ExternalStudy):
         mesh, parameters, snapshots = study.solutions()
         training, held_out = study.split(len(snapshots))
         return Snapshots(mesh, parameters, [[snapshots[i]] for i in training], [snapshots[i] for i in held_out])
     if executor is not None:
         return _solve(study, folder, executor)
-    with default_executor(workers or study.work.workers) as processes:
+    with default_executor(workers or study.work.workers, needs_main(study)) as processes:
         return _solve(study, folder, processes)
 
 
 def _solve(study: ParametricStudy, folder: Path, executor: Executor) -> Snapshots:
     """Choose the samples and solve them."""
+    keep_threads(study)  # what is reduced and refined later runs in this process
 
     def sweep(samples: Array) -> SweepResult:
         return run_sweep(study, study.canonical(samples), folder, executor)

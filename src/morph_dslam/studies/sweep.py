@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.writing import writing
 from morph_dslam.studies.executors import slots
 from morph_dslam.studies.problem import ParametricStudy
 from morph_dslam.studies.sample_task import SampleResult, solve_sample
@@ -28,6 +29,10 @@ from morph_dslam.studies.snapshots import PARTIAL, SOLVER_VERSION, damage, load_
 Array = NDArray[np.float64]
 #: A sample is given up after so many attempts from different neighbours.
 MOST_ATTEMPTS = 2
+FIRST_FAILURE = (
+    "a sample could not be solved: {}. The others are tried, which may take long; if fewer than half of all can be "
+    "solved, there will be no model. {}"
+)
 #: Steps and paths that differ by less, relatively, are equally long: rounding decides nothing.
 TIE = 1e-9
 
@@ -129,11 +134,12 @@ def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Ex
     Raises
     ------
     StudyError
-        If not even half of the samples converge, or another build is at work in ``folder``.
+        If not even half of the samples converge, another build is at work in ``folder``, or it cannot be written to.
     WorkerError
         If the executor's workers are lost or do not fit.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(StudyError, folder):
+        folder.mkdir(parents=True, exist_ok=True)
     fingerprint = study.fingerprint()
     keys = snapshot_keys(fingerprint, samples)
     paths = [folder / f"{key}.npz" for key in keys]
@@ -155,16 +161,21 @@ def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Ex
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """No other sweep writes to this folder; what one that was killed left unfinished is removed."""
-    with (folder / ".lock").open("w") as lock:
+    with writing(StudyError):
+        opened = (folder / ".lock").open("w")
+    with opened as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise StudyError(
                 f"another build is solving in {folder}: wait for it, or give this one another output"
             ) from error
-        for partial in folder.glob(f"*{PARTIAL}"):
-            partial.unlink()
-        yield
+        try:
+            for partial in folder.glob(f"*{PARTIAL}"):
+                partial.unlink()
+            yield
+        finally:  # workers forked meanwhile hold the file open too, which would keep it locked
+            fcntl.flock(lock, fcntl.LOCK_UN)
 
 
 class _Sweep:
@@ -193,6 +204,7 @@ class _Sweep:
         self.executor, self.progress = executor, progress
         self.result = SweepResult()
         self.tried: dict[int, list[int]] = {}
+        self.told = False
 
     def run(self) -> SweepResult:
         """Pass after pass, until all samples are solved or tried often enough."""
@@ -250,6 +262,7 @@ class _Sweep:
     def _keep(self, origin: int, sample: int, outcome: SampleResult) -> bool:
         """Write what a worker sent; whether that is a solution."""
         if outcome.snapshot is None:
+            self._tell_first(outcome.reason)
             self.attempts.record(origin, sample, outcome.reason)
             self._note_failure(sample, outcome.reason)
             return False
@@ -258,6 +271,12 @@ class _Sweep:
         self.result.failed.pop(sample, None)
         self.progress.update()
         return True
+
+    def _tell_first(self, reason: str) -> None:
+        """Say why an attempt failed, the first of this sweep: solving goes on, and may take long to no avail."""
+        if not self.told:
+            self.progress.write(FIRST_FAILURE.format(reason, self.study.advice), sys.stderr)
+        self.told = True
 
     def _note_failure(self, sample: int, reason: str) -> None:
         self.result.failed[sample] = reason

@@ -109,7 +109,7 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
     ),
     (
         lambda run: bool(run.other_cameras) and any(part.tracker.pose == "still" for part in run.objects),
-        "a pose that is one over the sequence is estimated from one camera: leave out --still or --with",
+        "one pose for the whole sequence is estimated from one camera: leave out --still or --with",
     ),
     (
         lambda run: bool(run.refine_camera) and (run.live or run.tracker.pose != "still" or bool(run.others)),

@@ -375,6 +375,8 @@ class Estimate:
     at_bound : (d,) parameters that ended at a bound of the box.
     iterations, converged : how the iteration ended.
     measured_covariance : the covariance without any prior on the parameters; None where there was none.
+    stated_covariance : the covariance before the residuals widen it, by what they show that model and reference are off
+        by; None where they do not.
     """
 
     state: State
@@ -386,11 +388,18 @@ class Estimate:
     iterations: int
     converged: bool
     measured_covariance: Array | None = None
+    stated_covariance: Array | None = None
 
     @property
     def parameter_std(self) -> Array:
         """Standard deviations of the parameters (d,), SI; very large where the images do not tell."""
         return np.sqrt(np.diag(self.covariance)[: len(self.state.parameters)])
+
+    @property
+    def stated_std(self) -> Array:
+        """Standard deviations of the parameters (d,), SI, before the residuals widen them."""
+        stated = self.covariance if self.stated_covariance is None else self.stated_covariance
+        return np.sqrt(np.diag(stated)[: len(self.state.parameters)])
 
     @property
     def pose_std(self) -> Array:

@@ -378,12 +378,13 @@ def new_filter(estimator: Fitter[Frame], options: TrackerOptions) -> SequenceFil
     """
     names = [parameter.name for parameter in estimator.model.parameters]
     walking = dict(options.random_walk)
-    for name, what in [(n, "be one over the sequence") for n in options.per_sequence] + [(n, "walk") for n in walking]:
+    constant = "be a per-sequence parameter"
+    for name, what in [(n, constant) for n in options.per_sequence] + [(n, "walk") for n in walking]:
         if name not in names:
             raise TrackingError(f"'{name}' cannot {what}: the model's parameters are " + (", ".join(names) or "none"))
     for name, step in walking.items():
         if name in options.per_sequence:
-            raise TrackingError(f"'{name}' is one over the sequence, so it cannot walk: leave out one of both")
+            raise TrackingError(f"'{name}' is a per-sequence parameter, so it cannot walk: leave out one of both")
         if not 0.0 < step < float("inf"):
             raise TrackingError(f"the step of the random walk of '{name}' must be a positive number")
     kept = [names.index(name) for name in options.per_sequence]
@@ -404,7 +405,7 @@ def temporal_facts(parameters: Sequence[Parameter], options: TrackerOptions) -> 
     walks = [f"{name} by {by_name[name].display(step):.4g} {by_name[name].unit}" for name, step in options.random_walk]
     said = []
     if options.per_sequence:
-        said.append(f"one over the sequence, from all frames so far: {', '.join(options.per_sequence)}")
+        said.append(f"per-sequence parameters, from all frames so far: {', '.join(options.per_sequence)}")
     if walks:
         said.append(f"random walk, standard deviation of the change from frame to frame: {', '.join(walks)}")
     start = "previous state; the first guess of image motion assumes constant velocity"

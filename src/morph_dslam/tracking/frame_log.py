@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from morph_dslam.errors import TrackingError
+from morph_dslam.io.writing import writing
 from morph_dslam.tracking.run_folder import RunFolder
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
@@ -77,14 +78,12 @@ class FrameLog:
 
     def start_again(self) -> None:
         """Empty the file, for another pass over the frames."""
-        try:
+        with writing(TrackingError, self._path):
             self._path.write_text("")
-        except OSError as error:
-            raise TrackingError(f"cannot write {self._path}: {error.strerror or error}") from error
 
     def __call__(self, tracked: TrackedFrame) -> None:
         """Write the frame that the run folder has just taken in."""
-        with self._path.open("a") as file:
+        with writing(TrackingError, self._path), self._path.open("a") as file:
             file.write(json.dumps(_line(self._folder.results)) + "\n")
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.parameter_errors import ParameterErrors
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.hypothesis import PoseHypothesis
@@ -111,6 +113,21 @@ def _with_systematic_errors(
     if systematic.reference_factor > CLEARLY_WORSE:
         warnings.append(ReferenceWidened(systematic.reference_factor))
     return estimate, left.px, warnings
+
+
+def with_discretisation(result: FrameResult, errors: ParameterErrors | None) -> FrameResult:
+    """The result with the error of the model's mesh in the deviations of its parameters.
+
+    It is the same in frames alike, so that no frame is weighed by it: only what is told of a frame has it. Parameters
+    that are known do not get one.
+    """
+    estimate = result.estimate
+    if errors is None or estimate is None:
+        return result
+    d, covariance = len(estimate.state.parameters), estimate.covariance.copy()
+    sought = np.diag(covariance)[:d] > 0.0
+    covariance[:d, :d] += np.outer(sought, sought) * errors.covariance(estimate.state.parameters)
+    return replace(result, estimate=replace(estimate, covariance=covariance))
 
 
 def pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:

@@ -18,12 +18,14 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.parameter_errors import ParameterErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
 from morph_dslam.tracking.frame_estimation import new_filter
+from morph_dslam.tracking.frame_results import with_discretisation
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.measurement import PATCH_WINDOW
@@ -235,14 +237,15 @@ class RigErrors:
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
+        stated = covariance
         for (view, frame), px in zip(both, common_px, strict=True):
             moved = view.systematic.pushed_by_model(frame, view.chain, gain, px)
             covariance = covariance + moved @ moved.T
         if self._is_known:
             pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
             transfer = gain @ np.sum(pushes, axis=0)
-            covariance = covariance + transfer @ transfer.T
-        return replace(estimate, covariance=covariance)
+            covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
+        return replace(estimate, covariance=covariance, stated_covariance=stated)
 
     def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
         views, first = [], 0
@@ -288,6 +291,8 @@ class RigTracker:
         If the object shows too few corners in a reference frame.
     TrackingError
         As `Tracker` does, or if the discrepancy is asked for, which is estimated from one camera.
+    ArgumentError
+        If model, registration or options are not what `Tracker` takes.
     """
 
     def __init__(
@@ -336,7 +341,7 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
-        self._errors = RigErrors(self.trackers, self.cameras)
+        self._errors, self._mesh_errors = RigErrors(self.trackers, self.cameras), ParameterErrors.of(self.model)
         self._sigma_px = FIRST_SIGMA_PX
 
     @property
@@ -412,7 +417,7 @@ class RigTracker:
             tracker.continue_from(part.seen(estimate.state))
         used = measured.weights > 0.0
         recovered = all(result.recovered or result.estimate is None for result in results)
-        return replace(
+        found = replace(
             result,
             warnings=(*warnings, *_not_explained(results, left)),
             unexplained_px=max(rest.px for rest in left),
@@ -423,6 +428,7 @@ class RigTracker:
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
         )
+        return with_discretisation(found, self._mesh_errors)
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""

@@ -83,13 +83,21 @@ def covariance_of_parameters(estimate: Estimate) -> Array:
 
 
 def unobservable_in_run(
-    parameters: Sequence[Parameter], estimates: Sequence[Estimate]
+    parameters: Sequence[Parameter], estimates: Sequence[tuple[Estimate, NDArray[np.bool_]]]
 ) -> dict[tuple[int, ...], tuple[int, Unobservable]]:
-    """What is unobservable in the frames of a run: by the parameters' indices in how many, and the last of it."""
+    """What is unobservable in the frames of a run: by the parameters' indices in how many, and the last of it.
+
+    Parameters
+    ----------
+    parameters : d of them.
+    estimates : of the frames, each with the parameters (d,) that are held at an end of their range: they do not count.
+    """
     d, ranges = len(parameters), np.array([p.upper - p.lower for p in parameters])
     found: dict[tuple[int, ...], tuple[int, Unobservable]] = {}
-    for estimate in estimates:
+    for estimate, held in estimates:
         for part in unobservable(covariance_of_parameters(estimate)[:d, :d], ranges):
+            if held[[*part.indices]].any():
+                continue
             found[part.indices] = (found.get(part.indices, (0, part))[0] + 1, part)
     return found
 

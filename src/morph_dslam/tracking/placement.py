@@ -108,8 +108,10 @@ class PlacedObject:
 
     def new_results(self, refined: bool = False) -> RunResults:
         """Results of no frame so far."""
-        angles = self.registration.per_sequence
-        return RunResults(self.model, self.frame, refined, self.options.per_sequence, angles, self.options.modulus_std)
+        angles, options = self.registration.per_sequence, self.options
+        return RunResults(
+            self.model, self.frame, refined, options.per_sequence, angles, options.modulus_std, self.object.points
+        )
 
     def new_tracker(self) -> Tracker | RigTracker:
         """A tracker at its beginning; raises RegistrationError if the object shows too few corners."""

@@ -40,6 +40,15 @@ class VectorEstimate:
     std: Array
     size_std: float
 
+    @classmethod
+    def of(cls, value: Array, covariance: Array) -> VectorEstimate:
+        """A vector (3,) whose components have a covariance (3, 3); deviations are infinite where that is not finite."""
+        if not np.isfinite(covariance).all():
+            return cls(value, np.full(3, np.inf), np.inf)
+        along = value / max(float(np.linalg.norm(value)), 1e-300)
+        variances = np.maximum([*np.diag(covariance), along @ covariance @ along], 0.0)
+        return cls(value, np.sqrt(variances[:3]), float(np.sqrt(variances[3])))
+
     @property
     def size(self) -> float:
         """Its length."""
@@ -80,16 +89,12 @@ class Reactions:
         """
         mu = estimate.state.parameters
         covariance = estimate.covariance[: len(mu), : len(mu)]
-        determined = bool(np.isfinite(covariance).all())
+        known = np.isfinite(covariance).all()
 
         def estimated(value: Array, slopes: Array) -> VectorEstimate:
-            if not determined:
-                return VectorEstimate(value, np.full(3, np.inf), np.inf)
+            of_parameters = slopes.T @ covariance @ slopes if known else np.full((3, 3), np.inf)
             # A common factor of the moduli is one more parameter, by which the derivative is the value itself.
-            of_components = slopes.T @ covariance @ slopes + modulus_std**2 * np.outer(value, value)
-            along = value / max(float(np.linalg.norm(value)), 1e-300)
-            variances = np.maximum([*np.diag(of_components), along @ of_components @ along], 0.0)
-            return VectorEstimate(value, np.sqrt(variances[:3]), float(np.sqrt(variances[3])))
+            return VectorEstimate.of(value, of_parameters + modulus_std**2 * np.outer(value, value))
 
         found = {}
         for name, fields in self._parts.items():

@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 
 from morph_dslam._version import __version__
 from morph_dslam.camera import Camera
+from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import cross_matrix, rotation_log
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.folders import make_run_folder
+from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.io.writing import writing
 from morph_dslam.model import save_model
 from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
@@ -28,7 +31,7 @@ from morph_dslam.model.stated_errors import force_error
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
-from morph_dslam.tracking.reactions import Reaction
+from morph_dslam.tracking.reactions import Reaction, VectorEstimate
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_notices import flags_of, notices_of
 from morph_dslam.tracking.run_results import RunResults
@@ -85,7 +88,16 @@ class RunFolder:
         ----------
         facts : more for the summary.
         notices : what a reader must know beside what the results show.
+
+        Raises
+        ------
+        TrackingError
+            If a file cannot be written.
         """
+        with writing(TrackingError, self.path):
+            return self._write(facts or {}, notices)
+
+    def _write(self, facts: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
         run, path = self.results, self.path
         write_hdf5(path / "result.h5", run)
         write_inner_positions(path / "result.h5", run, self._inner)
@@ -93,7 +105,7 @@ class RunFolder:
         save_trajectory(path / "trajectory.txt", camera_path(run))
         save_model(path / "model.morph", run.model.without_loads)
         save_camera(path / "camera.yaml", self._camera)
-        summary = summarise(run, notices) | (facts or {}) | {"versions": _versions()}
+        summary = summarise(run, notices) | facts | {"versions": _versions()}
         (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
         from morph_dslam.tracking.run_plots import write_plots  # matplotlib takes long to load
 
@@ -123,7 +135,7 @@ def _versions() -> dict[str, Any]:
 def write_hdf5(path: Path, run: RunResults) -> None:
     """Write ``result.h5``."""
     text = h5py.string_dtype()
-    with h5py.File(path, "w") as file:
+    with written_hdf5(path) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "reference_frame": run.reference_frame})
         file.attrs.update({"first_frame": run.frames[0], "last_frame": run.frames[-1]})
         file["frame"], file["timestamp"] = np.array(run.frames, dtype=np.int64), np.array(run.timestamps)
@@ -137,6 +149,7 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         if run.model.stresses:
             file["largest_von_mises"], file["largest_von_mises_std"] = run.largest_stresses().T
         _write_reactions(file, run)
+        _write_points(file, run)
         file["residual_rms_px"], file["unexplained_px"] = run.residuals_px(), run.unexplained_px()
         file["n_points"], file["n_inliers"] = run.counts().T
         file["timings_ms"] = run.timings_ms()
@@ -152,6 +165,33 @@ def _write_reactions(file: h5py.File, run: RunResults) -> None:
         parts = np.moveaxis(np.array(rows), 1, 0)
         for part, values in zip(("point", "force", "force_std", "moment", "moment_std"), parts, strict=True):
             file[f"reactions/{name}/{part}"] = values
+
+
+def _write_points(file: h5py.File, run: RunResults) -> None:
+    """``points/NAME/rest`` (3,), ``displacement`` and ``displacement_std`` (f, 3), NaN where hidden or lost."""
+    for k, (name, frames) in enumerate(run.point_displacements().items()):
+        assert run.points is not None
+        parts = np.array([_with_deviations(one) for one in frames])
+        file[f"points/{name}/rest"] = run.points.rest[k]
+        file[f"points/{name}/displacement"], file[f"points/{name}/displacement_std"] = parts[:, :3], parts[:, 3:]
+
+
+def _with_deviations(vector: VectorEstimate | None) -> Array:
+    """Components and their standard deviations (6,), NaN without a vector."""
+    return np.full(6, np.nan) if vector is None else np.concatenate([vector.value, vector.std])
+
+
+def _point_columns(run: RunResults) -> tuple[list[str], list[list[str]]]:
+    """Names of the columns with displacements of points, and what is in them in each frame, millimetres."""
+    names: list[str] = []
+    rows: list[list[str]] = [[] for _ in run.frames]
+    for point, frames in run.point_displacements().items():
+        names += [f"displacement_{point}_{axis}{std}_mm" for std in ("", "_std") for axis in "xyz"]
+        for row, vector in zip(rows, frames, strict=True):
+            millimetres = 1e3 * _with_deviations(vector)
+            row += ["" if np.isnan(v) else f"{v:.4f}" for v in millimetres[:3]]
+            row += ["" if np.isnan(v) else f"{v:.3g}" for v in millimetres[3:]]
+    return names, rows
 
 
 def _parts_of(reaction: Reaction) -> tuple[Array, Array, Array, Array]:
@@ -181,13 +221,14 @@ def write_csv(path: Path, run: RunResults) -> None:
     header += ["largest_displacement_mm", "largest_displacement_std_mm"]
     header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
     header += ["residual_rms_px", "unexplained_px", "n_points", "n_inliers", "time_ms"]
-    names, reactions = _reaction_columns(run)
+    (of_reactions, reactions), (of_points, points) = _reaction_columns(run), _point_columns(run)
     largests = 1e3 * run.largest_displacements()
-    rows = zip(run.frames, run.timestamps, run.results, run.at_bound(), largests, reactions, strict=True)
+    more = [[*forces, *displacements] for forces, displacements in zip(reactions, points, strict=True)]
+    rows = zip(run.frames, run.timestamps, run.results, run.at_bound(), largests, more, strict=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(header + names)
-        for frame, timestamp, result, at_bound, largest, forces in rows:
+        writer.writerow(header + of_reactions + of_points)
+        for frame, timestamp, result, at_bound, largest, last in rows:
             row: list[Any] = [frame, f"{timestamp:.6f}", result.status, result.reason, result.pose_from]
             if result.estimate is None:
                 row += [""] * (3 * len(parameters) + 10)
@@ -201,7 +242,7 @@ def write_csv(path: Path, run: RunResults) -> None:
                 row += [f"{1e3 * value:.4f}" for value in pose.translation]
                 row += [f"{value:.4f}" for value in np.degrees(rotation_log(pose.rotation))]
                 row += [f"{result.residual_rms_px:.4f}", f"{result.unexplained_px:.4f}"]
-            writer.writerow([*row, result.n_points, result.n_inliers, f"{result.total_ms:.3f}", *forces])
+            writer.writerow([*row, result.n_points, result.n_inliers, f"{result.total_ms:.3f}", *last])
 
 
 def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]:
@@ -233,6 +274,7 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
             "largest": 1e3 * float(np.nanmax(beyond)),
         }
     summary["largest_forces"] = largest_forces(run)
+    summary["points"] = largest_of_points(run)
     summary["one_over_the_sequence"] = values_over_the_sequence(run)
     notices = [*notices, *notices_of(run)]
     summary["flags"] = flags_of(notices)
@@ -257,6 +299,21 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
                 figures |= {"model_error": error[0], "model_error_of": "all" if error[1] else "reduction"}
             found.append(figures)
     return sorted(found, key=lambda figures: -float(figures["force_N"]))
+
+
+def largest_of_points(run: RunResults) -> list[dict[str, Any]]:
+    """Of each named point its place, and its largest displacement with standard deviation and frame, millimetres."""
+    found: list[dict[str, Any]] = []
+    for k, (name, frames) in enumerate(run.point_displacements().items()):
+        assert run.points is not None
+        figures: dict[str, Any] = {"name": name, "at_mm": (1e3 * run.points.rest[k]).tolist()}
+        known = [(vector, frame) for vector, frame in zip(frames, run.frames, strict=True) if vector is not None]
+        if known:
+            largest, frame = max(known, key=lambda one: one[0].size)
+            figures |= {"displacement_mm": 1e3 * largest.size, "standard_deviation_mm": 1e3 * largest.size_std}
+            figures["frame"] = frame
+        found.append(figures)
+    return found
 
 
 def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
@@ -297,7 +354,7 @@ def centre_and_std(
 def write_inner_positions(path: Path, run: RunResults, structures: Sequence[CarriedStructure]) -> None:
     """Add ``inner/NAME/centre`` and ``centre_std`` (f, 3), metres, NaN where lost, to ``result.h5``."""
     lost = (np.full(3, np.nan), np.full(3, np.nan))
-    with h5py.File(path, "a") as file:
+    with written_hdf5(path, append=True) as file:
         for structure in structures:
             rows = [
                 lost if result.estimate is None else centre_and_std(structure, result.estimate, result.discrepancy)

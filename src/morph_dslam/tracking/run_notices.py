@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.notices import Notice
@@ -15,7 +16,7 @@ from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
 from morph_dslam.tracking.outcomes import CamerasDisagree, DepthNotUsed, ModelDoesNotExplain, ObjectMoved, Status
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
+from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, FLOOR_PX, UNEXPLAINED_PX
 
 
 class RunWarning(StrEnum):
@@ -65,7 +66,7 @@ class RunWarning(StrEnum):
     )
     AT_BOUND = (
         "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object may be "
-        "outside what the model covers"
+        "outside what the model covers; widen the range in the study and build again"
     )
     UNOBSERVABLE = "{statement}"
     REREGISTERED = "registered anew in frame {frame}"
@@ -107,7 +108,8 @@ class RunNotice(Notice):
 
 def notices_of(run: RunResults) -> list[RunNotice]:
     """What a reader of the results must know."""
-    found, of, n_frames = [], RunNotice.of, len(run)
+    held = _held_at_bound(run)
+    found, of, n_frames = _at_bound(run, held), RunNotice.of, len(run)
     lost = sum(result.status is Status.LOST for result in run.results)
     if lost:
         found.append(of(RunWarning.LOST, count=lost, n_frames=n_frames))
@@ -134,13 +136,13 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
         found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))
-    factor = max((result.reference_factor for result in run.results), default=1.0)
+    factor = float(np.max(run.reference_factors(), initial=1.0))
     if factor > CLEARLY_WORSE:
         found.append(of(RunWarning.REFERENCE_WIDENED, factor=factor))
     doubtful = doubtful_errors(run.model)
     if doubtful:
         found.append(of(RunWarning.DOUBTFUL_FIELDS, relative=doubtful, errors=errors_in_words(doubtful)))
-    return [*found, *_at_bound(run), *_unobservable(run)]
+    return [*found, *_unobservable(run, held)]
 
 
 def flags_of(notices: Sequence[Notice]) -> list[str]:
@@ -167,18 +169,44 @@ def _frames(count: int) -> str:
     return f"{count} frame{'s' * (count != 1)}"
 
 
-def _at_bound(run: RunResults) -> list[RunNotice]:
-    """Parameters that the images put to an end of their range, unless the undeformed object has them there."""
-    found = []
+def _held_at_bound(run: RunResults) -> NDArray[np.bool_]:
+    """Where (f, d) the images put a parameter to an end of its range, unless the undeformed object has it there.
+
+    A deviation as wide as the range leaves open where the parameter is. But the farther the object is outside of the
+    range, the more the residuals widen the deviations: where they do, those that the noise alone would leave count.
+    """
+    d = len(run.model.study_parameters)
+    of_widths = UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
     with np.errstate(invalid="ignore"):
-        determined = run.parameter_std() < UNOBSERVABLE_SHARE * (run.model.upper - run.model.lower)
-    at_bound, values = run.at_bound() & determined, run.parameters()
+        widened = (run.unexplained_px() > CLEARLY_WORSE * FLOOR_PX) | (run.reference_factors() > CLEARLY_WORSE)
+        deviations = np.where(widened[:, None], _std_by_noise(run, widened), run.parameter_std())
+        at_bound = (run.at_bound() & (deviations < of_widths))[:, :d]
+    ends = np.where(_upper_side(run), run.model.upper[:d], run.model.lower[:d])
+    return np.asarray(at_bound & (ends != run.model.default[:d]))
+
+
+def _std_by_noise(run: RunResults, widened: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Standard deviations of the parameters (f, d) if the residuals were as small as in frames (f,) not ``widened``."""
+    sigmas = run.sigmas_px()
+    others = sigmas[~widened & run.tracked]
+    noise = min(float(np.median(others)), UNEXPLAINED_PX) if len(others) else UNEXPLAINED_PX
+    return np.asarray(run.stated_std() * np.minimum(noise / sigmas, 1.0)[:, None])
+
+
+def _upper_side(run: RunResults) -> NDArray[np.bool_]:
+    """Where (f, d) a parameter is nearer to the upper end of its range than to the lower one."""
+    d, model = len(run.model.study_parameters), run.model
+    return np.asarray(run.parameters()[:, :d] > 0.5 * (model.lower + model.upper)[:d])
+
+
+def _at_bound(run: RunResults, held: NDArray[np.bool_]) -> list[RunNotice]:
+    """Of each parameter and end of its range, in how many frames it is ``held`` (f, d) there."""
+    found, upper = [], _upper_side(run)
     for k, parameter in enumerate(run.model.study_parameters):
-        upper = values[:, k] > 0.5 * (parameter.lower + parameter.upper)
         unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
         for bound, side, rows in ((parameter.lower, "lower", ~upper), (parameter.upper, "upper", upper)):
-            count = int((at_bound[:, k] & rows).sum())
-            if count and bound != parameter.default:
+            count = int((held & rows)[:, k].sum())
+            if count:
                 shown = f"{parameter.display(bound):.4g}{unit}"
                 found.append(
                     RunNotice.of(RunWarning.AT_BOUND, parameter=parameter.name, side=side, bound=shown, count=count)
@@ -186,10 +214,14 @@ def _at_bound(run: RunResults) -> list[RunNotice]:
     return found
 
 
-def _unobservable(run: RunResults) -> list[RunNotice]:
-    """What the images do not give; of per-sequence parameters only what they do not after the last frame."""
-    parameters, estimates = run.model.study_parameters, [r.estimate for r in run.results if r.estimate]
-    constant, found = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}, []
+def _unobservable(run: RunResults, held: NDArray[np.bool_]) -> list[RunNotice]:
+    """What the images do not give, but for what is ``held`` (f, d) at an end of its range.
+
+    Of per-sequence parameters only what they do not give after the last frame.
+    """
+    parameters = run.model.study_parameters
+    estimates = [(r.estimate, rows) for r, rows in zip(run.results, held, strict=True) if r.estimate]
+    constant, found = {k for k, p in enumerate(parameters) if p.name in run.per_sequence}, list[RunNotice]()
     for part_of_run, is_last in ((estimates, False), (estimates[-1:], True)):
         for indices, (count, part) in unobservable_in_run(parameters, part_of_run).items():
             if constant.issuperset(indices) is is_last:

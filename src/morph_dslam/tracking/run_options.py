@@ -8,6 +8,7 @@ from pathlib import Path
 from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.landmarks import CLICK_PX
 from morph_dslam.tracking.drawing import DrawOptions
+from morph_dslam.tracking.named_points import Place
 from morph_dslam.tracking.option_values import FileOptions
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.still import CameraTerm
@@ -27,6 +28,8 @@ class ObjectOptions(FileOptions):
     at_rest : whether the object is undeformed in the frame of its landmarks, its parameters at their defaults.
     reregister_at : frames in which to register it anew, with landmarks there, or None for the initializer.
     inner : structures inside of it (`morph inner`), whose positions are written and drawn.
+    points : names of places of it whose displacements are written and plotted, each with its coordinates in the
+        undeformed object, metres.
     tracker : what is measured, and what earlier frames add.
     """
 
@@ -38,6 +41,7 @@ class ObjectOptions(FileOptions):
     initializer: InitializerFiles = field(default_factory=InitializerFiles)
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
     inner: tuple[Path, ...] = ()
+    points: tuple[Place, ...] = ()
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
 

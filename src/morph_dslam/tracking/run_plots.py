@@ -30,6 +30,8 @@ def write_plots(folder: Path, run: RunResults) -> None:
     if run.model.study_parameters:
         plot_confidence(folder / "confidence.png", run)
         plot_parameters(folder / "parameters.png", run)
+    if run.points is not None:
+        plot_points(folder / "points.png", run)
     if run.reactions():
         plot_reactions(folder / "reactions.png", run)
     plot_residual(folder / "residual.png", run)
@@ -101,6 +103,26 @@ def plot_reactions(path: Path, run: RunResults) -> None:
         _plot_band(axes, run, both[:, 0], both[:, 1], (0.0, top))
         axes.set_ylabel(label, fontsize=8)
     all_axes[0].legend(loc="upper left", fontsize=8)
+    figure.savefig(path, dpi=DPI)
+
+
+def plot_points(path: Path, run: RunResults) -> None:
+    """The displacement of each named point along x, y and z, each with a band of two standard deviations."""
+    displacements = run.point_displacements()
+    figure, all_axes = _rows(len(displacements), 1.9)
+    lost = np.full(3, np.nan)
+    for axes, (name, frames) in zip(all_axes, displacements.items(), strict=True):
+        values = 1e3 * np.array([lost if one is None else one.value for one in frames])
+        deviations = 1e3 * np.array([lost if one is None else one.std for one in frames])
+        reach = 1.2 * float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+        for k, axis in enumerate("xyz"):
+            low, high = (np.clip(values[:, k] + side * 2.0 * deviations[:, k], -reach, reach) for side in (-1.0, 1.0))
+            axes.fill_between(run.frames, low, high, color=f"C{k}", alpha=0.25, linewidth=0)
+            axes.plot(run.frames, values[:, k], color=f"C{k}", linewidth=1.4, label=axis)
+        axes.set_ylim(-reach, reach)
+        axes.set_ylabel(f"displacement of {name} [mm]", fontsize=8)
+        _shade_lost(axes, run)
+    all_axes[0].legend(loc="upper left", fontsize=8, ncols=3, title="±2 standard deviations", title_fontsize=8)
     figure.savefig(path, dpi=DPI)
 
 

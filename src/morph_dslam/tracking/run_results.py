@@ -9,13 +9,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model import ReducedModel
+from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.discrepancy import largest_deformation
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.observability import largest_displacement, largest_von_mises
 from morph_dslam.tracking.outcomes import Status
-from morph_dslam.tracking.reactions import Reaction, Reactions
+from morph_dslam.tracking.reactions import Reaction, Reactions, VectorEstimate
 from morph_dslam.tracking.result import STAGES, FrameResult
 
 Array = NDArray[np.float64]
@@ -33,6 +34,7 @@ class RunResults:
     per_sequence : names of the parameters that are the same in all frames.
     revolution_angles : names of those that are angles about an axis of revolution, which go on beyond their bounds.
     modulus_std : standard deviation of a factor common to all moduli, a share.
+    points : places of the object that are followed by name; None where there are none.
     frames : (f,) numbers.
     timestamps : (f,) seconds.
     results : (f,), without the residuals of single points: runs may be long.
@@ -44,6 +46,7 @@ class RunResults:
     per_sequence: tuple[str, ...] = ()
     revolution_angles: tuple[str, ...] = ()
     modulus_std: float = 0.0
+    points: NamedPoints | None = None
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
@@ -92,6 +95,10 @@ class RunResults:
         """(f, d), SI, NaN where lost."""
         return self._of_estimates(lambda estimate: estimate.parameter_std, np.nan)
 
+    def stated_std(self) -> Array:
+        """(f, d), SI, of the parameters before the residuals widen them, NaN where lost."""
+        return self._of_estimates(lambda estimate: estimate.stated_std, np.nan)
+
     def at_bound(self) -> NDArray[np.bool_]:
         """(f, d), false where lost, and for angles about an axis of revolution, which go on beyond their bounds."""
         has_bounds = np.array([one.name not in self.revolution_angles for one in self.model.parameters], dtype=bool)
@@ -117,6 +124,32 @@ class RunResults:
         """Of each support what it exerts in every frame, None where the object was hidden or lost."""
         frames = self._known_reactions()
         return {name: [frame.get(name) for frame in frames] for name in self._reactions_of_model.names}
+
+    def point_displacements(self) -> dict[str, list[VectorEstimate | None]]:
+        """Of each named point its displacement in every frame, object frame, metres, None where hidden or lost."""
+        if self.points is None:
+            return {}
+        rows = [self._displacements_of_points(result) for result in self.results]
+        return {name: [None if row is None else row[k] for row in rows] for k, name in enumerate(self.points.names)}
+
+    def _displacements_of_points(self, result: FrameResult) -> list[VectorEstimate] | None:
+        assert self.points is not None
+        if result.estimate is None:
+            return None
+        values, slopes = self._field_of_points.value_and_sensitivities(result.estimate.state.parameters)
+        if result.discrepancy is not None:
+            values = values + result.discrepancy.displacement(self.points.rest)
+        d = len(slopes)
+        covariance = result.estimate.covariance[:d, :d]
+        if not np.isfinite(covariance).all():
+            return [VectorEstimate.of(value, np.full((3, 3), np.inf)) for value in values]
+        of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
+        return [VectorEstimate.of(value, of_point) for value, of_point in zip(values, of_points, strict=True)]
+
+    @cached_property
+    def _field_of_points(self) -> SeparatedField:
+        assert self.points is not None
+        return self.model.restrict(self.points.points)
 
     def last_largest(self) -> tuple[float, float]:
         """The largest displacement (m) and von Mises stress (Pa) of the last frame, as above."""
@@ -177,9 +210,17 @@ class RunResults:
         """Root mean square residual (f,), NaN where lost."""
         return np.array([result.residual_rms_px for result in self.results])
 
+    def sigmas_px(self) -> Array:
+        """Robust standard deviation of a pixel coordinate's residual (f,), NaN where lost."""
+        return np.array([np.nan if r.estimate is None else r.estimate.sigma_px for r in self.results])
+
     def unexplained_px(self) -> Array:
         """What the model leaves of the residuals (f,), see `systematic_errors`; NaN where lost."""
         return np.array([result.unexplained_px for result in self.results])
+
+    def reference_factors(self) -> Array:
+        """By how much worse than stated the reference state is known (f,), by all frames until each."""
+        return np.array([result.reference_factor for result in self.results])
 
     def beyond_model(self) -> Array:
         """Largest displacement (f,) of a node of the surface beyond the model's and a rigid motion, metres.

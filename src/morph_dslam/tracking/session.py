@@ -8,9 +8,9 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
-from morph_dslam.errors import SourceError, check_kind
+from morph_dslam.errors import ArgumentError, SourceError, check_kind
 from morph_dslam.sources import Frame
-from morph_dslam.sources.frames import FrameSource
+from morph_dslam.sources.frames import FrameSource, check_frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
@@ -46,6 +46,11 @@ class Session:
     Attributes
     ----------
     n_dropped : number of live frames that came but were not handed out.
+
+    Raises
+    ------
+    ArgumentError
+        If trackers, source or sinks are of another kind.
     """
 
     def __init__(
@@ -59,6 +64,9 @@ class Session:
         reregistration: Mapping[str, Reregistration] | None = None,
     ) -> None:
         check_kind(trackers, Mapping, "trackers", "a tracker of each object by its name, {'object': tracker}")
+        check_kind(source, Iterable, "source", "frames: a list of md.Frame, or what open_source returns")
+        if not isinstance(sinks, Sequence) or not all(map(callable, sinks)):
+            raise ArgumentError("sinks are a list of functions of a TrackedFrame, of one too: [results.append]")
         self._objects, self._source, self._sinks = MultiObjectTracker(trackers), source, tuple(sinks)
         self._anchor, self._picture, self._reregistration = anchor, picture, reregistration or {}
         self._pipeline: LivePipeline | None = None
@@ -97,8 +105,12 @@ class Session:
 
     def _located(self) -> Iterator[tuple[tuple[Frame, ...], Localizations]]:
         """The frames of a recording with what `locate` found in them."""
+        before = None
         for item in self._source:
             frames = item if isinstance(item, tuple) else (item,)
+            for frame in frames:
+                check_frame(frame, before, getattr(self._source, "name", "the session's source"))
+            before = frames[0]
             yield frames, self.locate(frames)
 
     @one_thread_for_algebra
@@ -113,7 +125,8 @@ class Session:
         Raises
         ------
         MorphError
-            If a frame cannot be read or has not the camera's size. The sinks have all frames before it.
+            If a frame cannot be read, has not the camera's size, or its number is not above that of the frame before.
+            The sinks have all frames before it.
         """
         if isinstance(self._source, LiveStream):
             self._pipeline = LivePipeline(self._source, (self._locate_live, self._track_live, self._finish_live))

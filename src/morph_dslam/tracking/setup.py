@@ -24,6 +24,7 @@ from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.multi_camera import RigCamera
+from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.views import registered_keyframes
@@ -45,6 +46,7 @@ class TrackedObject:
     click_px : standard deviation of a landmark's pixel.
     at_rest : whether it is undeformed in the frame of its landmarks.
     snap : whether its outline in the frame of landmarks corrects them.
+    points : places of it that are followed by name; None where there are none.
     """
 
     name: str
@@ -57,6 +59,7 @@ class TrackedObject:
     click_px: float = CLICK_PX
     at_rest: bool = False
     snap: bool = False
+    points: NamedPoints | None = None
 
     @property
     def scene(self) -> Scene | None:
@@ -130,12 +133,13 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     inner = tuple(load_inner_structure(path) for path in part.inner)
     for structure in inner:
         structure.carried_by(model)  # raises before the tracking if it is not for this model
+    points = NamedPoints.of(model, part.points)
     again = {n: None if path is None else load_landmarks(path) for n, path in part.reregister_at}
     options = part.tracker
     if part.registration is None:
         start = initializer if part.landmarks is None else load_landmarks(part.landmarks)
         assert start is not None
-        said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap}
+        said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap, "points": points}
         return TrackedObject(name, model, start, options, inner, reregister_at=again, **said)
     registration, path = load_registration(part.registration, model), map_of(part.registration, run.map_path)
     if path is None and options.pose != "free":
@@ -147,7 +151,7 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     keyframes = registered_keyframes(registration)
     # Not the model of the file: beside a copy with an open angle it would be kept for nothing.
     return TrackedObject(
-        name, registration.model, registration, options, inner, keyframes, again, click_px=run.click_px
+        name, registration.model, registration, options, inner, keyframes, again, run.click_px, points=points
     )
 
 

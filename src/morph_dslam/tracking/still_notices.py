@@ -31,10 +31,10 @@ class PoseAwayFromLandmarks(RegistrationWarning):
     """
 
     template: ClassVar[str] = (
-        "in the one pose over the sequence the landmarks are {off_px:.0f} px ({off_mm:.2g} mm) off, number {worst} by "
-        "{worst_px:.0f} px; alone they fit to {alone_px:.1f} px. The motion fits the model best there: a support gives "
-        "way, or the mesh, the law or the lens is not the real one. Places on the mesh are off by as much; the motion "
-        "of what is seen there is not"
+        "in the one pose for the whole sequence the landmarks are {off_px:.0f} px ({off_mm:.2g} mm) off, number "
+        "{worst} by {worst_px:.0f} px; alone they fit to {alone_px:.1f} px. The motion fits the model best there: a "
+        "support gives way, or the mesh, the law or the lens is not the real one. Places on the mesh are off by as "
+        "much; the motion of what is seen there is not"
     )
     off_px: float
     off_mm: float

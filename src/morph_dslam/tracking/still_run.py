@@ -64,7 +64,7 @@ def with_still_pose(
         terms,
     )
     found = fit_still(problem, registration.alternatives)
-    facts = registration.facts | {"pose": f"one over the sequence, from {len(keyframes)} frames"}
+    facts = registration.facts | {"pose": f"one for the whole sequence, from {len(keyframes)} frames"}
     if found.terms:
         facts["camera"] = {term: {"value": value, "std": std} for term, (value, std) in found.terms.items()}
     warnings = registration.warnings

@@ -112,9 +112,14 @@ class StreamSink:
         self._stack.close()
 
     def __call__(self, tracked: TrackedFrame) -> None:
-        """Send a frame on, if anybody wants it; raises StreamError before `begin`."""
+        """Send a frame on, if anybody wants it; raises StreamError before `begin`, or if that named another object."""
         if not self._objects:
             raise StreamError("the stream does not know what is tracked: call its method begin(objects, camera) first")
+        if missing := [name for name in self._objects if name not in tracked.results]:
+            raise StreamError(
+                f"the stream was begun with the object '{missing[0]}', and the session tracks "
+                f"{', '.join(tracked.results)}: give begin(objects, camera) the names of the session's trackers"
+            )
         number, self._number = self._number, self._number + 1
         watched = [publisher for publisher in self.publishers if publisher.is_watched]
         if not watched:

@@ -227,6 +227,7 @@ class SystematicErrors:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
         covariance, by_reference = estimate.covariance.copy(), self._by_reference
+        stated = estimate.covariance
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
             by_reference = gain @ (frame.products(moved) + past @ self._by_reference)
@@ -240,13 +241,14 @@ class SystematicErrors:
             if learns and not self._still:
                 self._learn_reference(frame, frame.left(moved, by_reference))
             covariance += self._misfit.factor * by_reference @ by_reference.T
+            stated = stated + by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
         by_model = gain @ (common_px / np.sqrt(share) * gradients.T + past @ self._by_model)
         covariance += by_model @ by_model.T
         if keeps:
             self._by_reference, self._by_model = by_reference, by_model
-        return replace(estimate, covariance=covariance)
+        return replace(estimate, covariance=covariance, stated_covariance=stated)
 
     def _learn_reference(self, frame: Linearization, left: Array) -> None:
         """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""

@@ -274,7 +274,7 @@ class _Job:
         return opened
 
     def _track_refined(self, begun: Sequence[PlacedObject], opened: Mapping[str, OpenedSurface]) -> None:
-        """Refine what is one over the sequence, and track once more.
+        """Refine what is the same in the whole sequence, and track once more.
 
         Parameters
         ----------
@@ -282,7 +282,7 @@ class _Job:
         opened : by name, what a pass before found of surfaces that open: no pose explains these frames.
         """
         run = self._run
-        print("refining what is one over the sequence ...", file=sys.stderr)
+        print("refining what is the same in the whole sequence ...", file=sys.stderr)
         placed = []
         for part in begun:
             end = opened[part.name].first if part.name in opened else np.inf

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.parameter_errors import ParameterErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
@@ -31,7 +32,7 @@ from morph_dslam.tracking.frame_estimation import (
     new_filter,
     with_unobservable_at_default,
 )
-from morph_dslam.tracking.frame_results import lost_result, pose_source, tracked_result
+from morph_dslam.tracking.frame_results import lost_result, pose_source, tracked_result, with_discretisation
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
@@ -121,7 +122,8 @@ class Tracker:
     TrackingError
         If a per-sequence parameter, or one that walks, is not in the model, or the pose is to be fixed without a map.
     ArgumentError
-        If model, camera, registration or options are of another kind: files are read before.
+        If model, camera, registration or options are of another kind (files are read before), or the registration is of
+        another mesh than the model, or of other parameters.
     """
 
     def __init__(
@@ -144,6 +146,7 @@ class Tracker:
         self.camera, self.options, self.anchor = camera, options or TrackerOptions(), anchor
         check_pose(self.options, registration, in_map=anchor is not None or keyframes is not None)
         self.estimator = Estimator(self.model, camera, self.options.estimation)
+        self._mesh_errors = ParameterErrors.of(self.model)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
         use, sought = self.options.use_discrepancy, self.options.discrepancy
@@ -156,6 +159,7 @@ class Tracker:
         self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
+        self._last = self._velocity_base = self._start = registration.state
         self._jumps_before: tuple[DisplacementJump, ...] = ()
         if reference is not None:
             self._begin(reference if isinstance(reference, Image) else self._prepared(Picture.of(reference, camera)))
@@ -198,6 +202,7 @@ class Tracker:
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
             change = self._choose_view(image, hypothesis, result)
+            result = with_discretisation(result, self._mesh_errors)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
@@ -414,7 +419,8 @@ class Tracker:
     def continue_from(self, state: State) -> None:
         """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
         self._last = self._start = state
-        self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
+        if self._views is not None:
+            self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
     def _begin(self, image: Image) -> None:
         """Make the reference view."""
@@ -433,7 +439,6 @@ class Tracker:
         self.last_measured = view.nothing_measured
         self._image, self._pixels = image, view.pixels
         self._supported = np.ones(len(view.points), dtype=bool)
-        self._last = self._velocity_base = self._start = known.state
         self._beyond = known.discrepancy
 
     def _view_of(self, images: Sequence[PosedImage]) -> ReferenceView:

@@ -10,19 +10,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import SourceError, TrackingError, check_kind
+from morph_dslam.errors import ArgumentError, SourceError, TrackingError, check_kind
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.options import NO_MAP, TrackerOptions
 
+#: Nodes that are farther apart than this share of the object's size belong to different meshes.
+OTHER_MESH = 1e-3
+
 
 def check_tracker(model: object, registration: object, options: object) -> None:
-    """Raise ArgumentError unless these are what a tracker of one or several cameras takes."""
+    """Raise ArgumentError unless these are what a tracker of one or several cameras takes, and of one object."""
     check_kind(model, ReducedModel, "model", "the model that load_model reads from the file")
     given = "what register_landmarks, register_board, register or load_registration returns"
     check_kind(registration, Registration, "registration", given)
     check_kind(options, (TrackerOptions, type(None)), "options", "TrackerOptions(...)")
+    assert isinstance(model, ReducedModel)
+    assert isinstance(registration, Registration)
+    if difference := _difference(model, registration):
+        raise ArgumentError(
+            f"the registration is of another object than the model '{model.name}': {difference}; give the model that "
+            "was registered, or register this one"
+        )
+
+
+def _difference(model: ReducedModel, registration: Registration) -> str:
+    """In what the registration's mesh, or its parameters, are not the model's; empty if they are."""
+    known = registration.model
+    if known is model:
+        return ""
+    if len(known.nodes) != len(model.nodes):
+        return f"its mesh has {len(known.nodes)} nodes, and the model's {len(model.nodes)}"
+    apart = float(np.linalg.norm(known.nodes - model.nodes, axis=1).max())
+    if apart > OTHER_MESH * np.linalg.norm(np.ptp(model.nodes, axis=0)):
+        return f"nodes of its mesh are up to {1e3 * apart:.3g} mm from those of the model's"
+    # An angle about an axis that the registration left open is in its model alone.
+    names, given = (
+        [p.name for p in one.parameters if p.name not in registration.per_sequence] for one in (known, model)
+    )
+    if names != given:
+        return f"its parameters are {', '.join(names) or 'none'}, and the model's {', '.join(given) or 'none'}"
+    return ""
 
 
 def check_camera(camera: object) -> None:

@@ -23,7 +23,8 @@ import numpy as np
 from ngsolve.meshes import Make1DMesh
 from numpy.typing import NDArray
 
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import ArgumentError, StudyError
+from morph_dslam.units import FACTORS
 
 if TYPE_CHECKING:
     from morph_dslam.mechanics.materials.viscoelastic import Prony
@@ -165,15 +166,43 @@ def register_law(name: str) -> Callable[[_Law], _Law]:
             def distortional(self, F, J):
                 growth = ngs.exp(self.exponent * (first_invariant(F, J) - 3.0)) - 1.0
                 return 0.5 * self.mu / self.exponent * growth
+
+    A law of your own replaces another one of the same name.
+
+    Raises
+    ------
+    ArgumentError
+        If a built-in law has this name, or the class lacks a method of a law or names a quantity that there is not.
     """
 
     def register(law: _Law) -> _Law:
+        _check_law(name, law)
         made = dataclass(frozen=True, kw_only=True, eq=False)(law)
         made.law = name
         _LAWS[name] = made
         return made
 
     return register
+
+
+def _check_law(name: str, law: type[Material]) -> None:
+    """Raise ArgumentError unless studies can name and make this law."""
+    if not _is_built_in(law):
+        from morph_dslam.mechanics.materials.library import laws  # which imports this module
+
+        if name in laws() and _is_built_in(laws()[name]):
+            raise ArgumentError(f"'{name}' is a built-in law: register yours by another name")
+    if missing := sorted(getattr(law, "__abstractmethods__", ())):
+        raise ArgumentError(f"the law '{name}' has no method {missing[0]}: define it in the class {law.__name__}")
+    for constant, quantity in law.quantities.items():
+        if quantity not in FACTORS:
+            raise ArgumentError(
+                f"the law '{name}' has quantities = {{'{constant}': '{quantity}'}}: give one of {', '.join(FACTORS)}"
+            )
+
+
+def _is_built_in(law: type[Material]) -> bool:
+    return law.__module__.startswith(f"{__package__}.")
 
 
 def registered_laws() -> dict[str, type[Material]]:

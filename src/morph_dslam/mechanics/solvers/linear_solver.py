@@ -26,7 +26,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
-from morph_dslam.errors import SolverError
+from morph_dslam.errors import SolverError, how_to_install
 
 Array = NDArray[np.float64]
 #: scipy.sparse.csr_matrix, which has no usable type stubs.
@@ -194,7 +194,7 @@ def default_engine() -> str:
     if chosen not in ("pardiso", "sparsecholesky"):
         raise SolverError(f"{ENVIRONMENT_VARIABLE}={chosen} is unknown: use pardiso or sparsecholesky")
     if chosen == "pardiso" and not installed:
-        raise SolverError(f"{ENVIRONMENT_VARIABLE}=pardiso needs pypardiso: pip install 'morph-dslam[pardiso]'")
+        raise SolverError(f"{ENVIRONMENT_VARIABLE}=pardiso needs pypardiso: {how_to_install('pardiso')}")
     return chosen
 
 

@@ -1,0 +1,109 @@
+"""HDF5 files that are written to their end, or deleted: a full disk ends no program."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from morph_dslam.io.writing import removed_on_failure
+
+if sys.platform != "win32":
+    import fcntl
+
+
+class _Drive(io.FileIO):
+    """A file for the HDF5 library, which may end the program where a drive does not take what is left on closing.
+
+    After a write that fails all others seem to succeed.
+
+    Parameters
+    ----------
+    path : of the file.
+    append : whether to keep what it holds.
+
+    Attributes
+    ----------
+    failure : what the system said first; None if it took everything.
+
+    Raises
+    ------
+    BlockingIOError
+        If another program writes to the file.
+    """
+
+    failure: OSError | None = None
+
+    def __init__(self, path: Path, append: bool) -> None:
+        super().__init__(os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0) | (0 if append else os.O_CREAT)), "r+")
+        try:
+            self._lock()
+            if not append:
+                super().truncate(0)
+        except OSError:
+            self.close()
+            raise
+
+    def _lock(self) -> None:
+        """Keep other programs out, as the HDF5 library does."""
+        if sys.platform == "win32":
+            return
+        try:
+            fcntl.flock(self, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise
+        except OSError:  # no locks on this drive
+            pass
+
+    def close(self) -> None:
+        if sys.platform != "win32" and not self.closed:
+            with suppress(OSError):
+                fcntl.flock(self, fcntl.LOCK_UN)  # processes forked meanwhile hold the file open too
+        super().close()
+
+    def write(self, data: Any, /) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while self.failure is None and len(left):
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.failure = error
+        return size
+
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
+
+
+@contextmanager
+def written_hdf5(path: Path, append: bool = False, **options: Any) -> Iterator[h5py.File]:
+    """An HDF5 file to write, which is deleted if that fails.
+
+    Parameters
+    ----------
+    path : of the file.
+    append : whether to keep what it holds.
+    options : for `h5py.File`.
+
+    Raises
+    ------
+    OSError
+        Which names the file, if it cannot be written to its end.
+    """
+    with _Drive(path, append) as drive, removed_on_failure(path):
+        try:
+            with h5py.File(drive, "r+" if append else "w", **options) as file:
+                yield file
+        finally:
+            if drive.failure is not None:
+                raise OSError(drive.failure.errno, drive.failure.strerror, str(path)) from drive.failure

@@ -1,0 +1,36 @@
+"""Files that cannot be written: whoever asked for them is told which one it is, and no half of it stays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from morph_dslam.errors import MorphError, refusal
+
+
+@contextmanager
+def writing(kind: type[MorphError], path: Path | None = None) -> Iterator[None]:
+    """Say which file cannot be written.
+
+    Parameters
+    ----------
+    kind : of the error that is raised in place of the system's.
+    path : the file, or the folder of the files that are written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"cannot write {refusal(error, path)}") from error
+
+
+@contextmanager
+def removed_on_failure(path: Path) -> Iterator[None]:
+    """Delete a file that has not been written to its end."""
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            if path.is_file():  # and no device
+                path.unlink()
+        raise

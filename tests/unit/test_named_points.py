@@ -1,0 +1,157 @@
+"""Named points of a run: where they are, how far they move and how well that is known, and what is refused."""
+
+import csv
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from morph_dslam.cli.track import print_summary
+from morph_dslam.errors import TrackingError
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.named_points import NamedPoints
+from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
+from morph_dslam.tracking.result import FrameResult
+from morph_dslam.tracking.run_folder import summarise, write_csv, write_hdf5
+from morph_dslam.tracking.run_plots import plot_points
+from morph_dslam.tracking.run_results import RunResults
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.stretched_block import SIZE, stretched_block_model
+
+MODEL = bent_sheet_model(23, 17)  # with a node in the middle
+CORNER = ("corner", (0.210, 0.1485, 0.0))
+#: Of arch (m), skew and twist (rad): correlated, and a pose that has no part in it.
+ROOT = np.array([[1e-3, 0.0, 0.0], [0.02, 0.05, 0.0], [0.01, 0.0, 0.02]])
+STATE = np.array([0.04, 0.3, 0.1])
+
+
+def in_frame(model, parameters, covariance):
+    pose = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    d = len(parameters)
+    whole = np.diag(np.r_[np.zeros(d), np.full(6, 9.0)])
+    whole[:d, :d] = covariance
+    estimate = Estimate(
+        State(np.array(parameters), pose), 1.0, np.zeros((9, 2)), 0.3, whole, np.zeros(d, bool), 4, True
+    )
+    return FrameResult(model, Status.TRACKED, estimate, FoundBy.FLOW, residual_rms_px=0.4, unexplained_px=0.0)
+
+
+def lost_frame(model):
+    return FrameResult(model, Status.LOST, rejection=Rejection(RejectionReason.FEW_POINTS, 4, 300, 30))
+
+
+def run_of(model, places, *results):
+    run = RunResults(model, 0, points=NamedPoints.of(model, places))
+    for number, result in enumerate(results):
+        run.add(number, 0.1 * number, result)
+    return run
+
+
+def test_displacement_of_a_point_inside_is_the_closed_form():
+    """A block that is stretched along x by e and sheared along x by s: u = e x + s z / height."""
+    model, (x, y, z) = stretched_block_model(), (0.05, 0.02, 0.03)
+    stretch_std, slide_std = 0.01, 2e-4
+    result = in_frame(model, [0.15, -0.004], np.diag([stretch_std**2, slide_std**2]))
+    (found,) = run_of(model, [("inside", (x, y, z))], result).point_displacements()["inside"]
+    np.testing.assert_allclose(found.value, [0.15 * x - 0.004 * z / SIZE[2], 0.0, 0.0], atol=1e-12)
+    deviation = np.hypot(stretch_std * x, slide_std * z / SIZE[2])
+    np.testing.assert_allclose(found.std, [deviation, 0.0, 0.0], atol=1e-12)
+    assert found.size_std == pytest.approx(deviation)
+
+
+def test_deviations_are_finite_differences_times_the_covariance():
+    node = int(np.linalg.norm(MODEL.nodes - CORNER[1], axis=1).argmin())
+    result = in_frame(MODEL, STATE, ROOT @ ROOT.T)
+    (found,) = run_of(MODEL, [CORNER], result).point_displacements()["corner"]
+    step = 1e-6
+    slopes = np.array(
+        [
+            (MODEL.positions(STATE + change) - MODEL.positions(STATE - change))[node] / (2.0 * step)
+            for change in step * np.eye(3)
+        ]
+    )
+    covariance = slopes.T @ ROOT @ ROOT.T @ slopes
+    value = MODEL.positions(STATE)[node] - MODEL.nodes[node]
+    np.testing.assert_allclose(found.value, value, atol=1e-12)
+    np.testing.assert_allclose(found.std, np.sqrt(np.diag(covariance)), rtol=1e-6)
+    along = value / np.linalg.norm(value)
+    assert found.size_std == pytest.approx(float(np.sqrt(along @ covariance @ along)), rel=1e-6)
+
+
+def test_unknown_parameters_leave_a_displacement_open():
+    result = in_frame(MODEL, STATE, np.full((3, 3), np.inf))
+    (found,) = run_of(MODEL, [CORNER], result).point_displacements()["corner"]
+    assert np.isinf([*found.std, found.size_std]).all()
+
+
+def test_table_file_summary_and_plot_have_each_point(tmp_path, capsys):
+    small = in_frame(MODEL, 0.5 * STATE, ROOT @ ROOT.T)
+    places = [CORNER, ("middle", (0.0, 0.0, 0.0))]
+    run = run_of(MODEL, places, small, in_frame(MODEL, STATE, ROOT @ ROOT.T), lost_frame(MODEL))
+    write_csv(tmp_path / "frames.csv", run)
+    rows = list(csv.DictReader((tmp_path / "frames.csv").read_text().splitlines()))
+    kinds = [f"{axis}{std}_mm" for std in ("", "_std") for axis in "xyz"]
+    names = [f"displacement_{name}_{kind}" for name in ("corner", "middle") for kind in kinds]
+    assert list(rows[0])[-12:] == names
+    assert [rows[2][name] for name in names] == [""] * 12
+    # The middle of the sheet goes up by the arch alone.
+    assert float(rows[1]["displacement_middle_z_mm"]) == pytest.approx(40.0, abs=1e-3)
+    assert float(rows[1]["displacement_middle_z_std_mm"]) == pytest.approx(1.0, abs=1e-2)
+    write_hdf5(tmp_path / "result.h5", run)
+    with h5py.File(tmp_path / "result.h5") as file:
+        np.testing.assert_allclose(file["points/corner/rest"], CORNER[1], atol=1e-12)
+        values, deviations = file["points/middle/displacement"][()], file["points/middle/displacement_std"][()]
+    np.testing.assert_allclose(values[:2, 2], [0.02, 0.04], atol=1e-12)
+    np.testing.assert_allclose(deviations[:2, 2], 1e-3, rtol=1e-9)
+    assert np.isnan([values[2], deviations[2]]).all()
+    summary = summarise(run)
+    middle = summary["points"][1]
+    assert (middle["name"], middle["at_mm"], middle["frame"]) == ("middle", pytest.approx([0.0] * 3, abs=1e-9), 1)
+    print_summary(tmp_path, summary)
+    assert "largest displacement of 'middle': 40 ± 1 mm in frame 1\n" in capsys.readouterr().out
+    plot_points(tmp_path / "points.png", run)
+    assert (tmp_path / "points.png").stat().st_size > 1000
+
+
+def test_a_run_without_named_points_has_nothing_of_them(tmp_path):
+    run = run_of(MODEL, [], in_frame(MODEL, STATE, ROOT @ ROOT.T))
+    write_csv(tmp_path / "frames.csv", run)
+    assert "displacement_" not in (tmp_path / "frames.csv").read_text().replace("largest_displacement_", "")
+    assert summarise(run)["points"] == []
+
+
+def test_a_place_just_off_the_object_is_drawn_to_it():
+    model = stretched_block_model()
+    found = NamedPoints.of(model, [("top", (0.02, 0.01, SIZE[2] + 1e-4)), ("inside", (0.02, 0.01, 0.03))])
+    assert found is not None
+    np.testing.assert_allclose(found.rest, [[0.02, 0.01, SIZE[2]], [0.02, 0.01, 0.03]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("places", "message"),
+    [
+        (
+            [("tip", (0.02, 0.01, SIZE[2] + 0.012))],
+            rf"'tip' at \(20, 10, {1e3 * SIZE[2] + 12:g}\) mm is 12.0 mm off .* the nearest place is \(20, 10, "
+            rf"{1e3 * SIZE[2]:g}\) mm",
+        ),
+        ([("tip", (np.nan, 0.0, 0.0))], "'tip' has no finite coordinates"),
+        ([("a/b", (0.0, 0.0, 0.0))], "'a/b' is no name of a point"),
+        ([("tip", (0.0, 0.0, 0.0)), ("tip", (0.01, 0.0, 0.0))], "two points are called 'tip'"),
+    ],
+)
+def test_what_is_no_point_of_the_object_is_refused(places, message):
+    with pytest.raises(TrackingError, match=message):
+        NamedPoints.of(stretched_block_model(), places)
+
+
+def test_points_of_a_rigid_object_are_refused():
+    with pytest.raises(TrackingError, match="is rigid"):
+        NamedPoints.of(replace(MODEL, parameters=()), [CORNER])
+
+
+@pytest.mark.parametrize("text", ["tip", "tip=1,2", "=1,2,3", "tip=1,2,x", "tip=1,2,inf", "tip=1,2,3,4"])
+def test_what_is_no_name_with_coordinates_is_refused(text, refused):
+    assert "not a name and three coordinates in millimetres" in refused("track", "frames", "--point", text)

@@ -1,0 +1,76 @@
+"""What the discretisation error amounts to in the parameters, on a block that is stretched and sheared evenly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.model.parameter_errors import ParameterErrors, equivalent_errors, parameter_errors
+from morph_dslam.tracking.frame_results import with_discretisation
+from tests.support.streamed import tracked_result
+from tests.support.stretched_block import SIZE, stretched_block_model
+
+#: Parameters, SI, at which the block was solved again, and what they have to be for the finer displacement.
+STATES = np.array([[0.1, 0.002], [-0.05, 0.006]])
+MEANT = np.array([[0.104, 0.0017], [-0.052, 0.0063]])
+
+
+def displacement(model, mu):
+    """(n, 3) in closed form."""
+    x, z = model.nodes[:, 0], model.nodes[:, 2]
+    return np.column_stack([mu[0] * x + mu[1] * z / SIZE[2], np.zeros((len(x), 2))])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return stretched_block_model()
+
+
+@pytest.fixture(scope="module")
+def certified(model):
+    states = [
+        (mu, displacement(model, mu), displacement(model, meant)) for mu, meant in zip(STATES, MEANT, strict=True)
+    ]
+    return replace(model, certificate={"discretisation": {"parameters": parameter_errors(model, states)}})
+
+
+def test_what_parameters_explain_of_an_error_is_found_and_the_rest_is_not(model):
+    error = displacement(model, MEANT[0]) - displacement(model, STATES[0])
+    # Motion along y is orthogonal to all that the parameters do.
+    error[:, 1] += 1e-4
+    assert equivalent_errors(model, STATES[0], error) == pytest.approx(MEANT[0] - STATES[0], rel=1e-9)
+
+
+def test_the_certificate_has_them_by_name_with_the_size_of_the_displacement(model, certified):
+    entry = certified.certificate["discretisation"]["parameters"]
+    for k, name in enumerate(("stretch", "slide")):
+        assert entry["errors"][name] == pytest.approx((MEANT - STATES)[:, k], rel=1e-9)
+    sizes = [1e3 * np.sqrt(np.mean(np.sum(displacement(model, meant) ** 2, axis=1))) for meant in MEANT]
+    assert entry["displacement_rms_mm"] == pytest.approx(sizes, rel=1e-12)
+
+
+def test_deviations_hold_them_in_proportion_to_the_displacement(model, certified):
+    stretch, slide = 0.06, 0.004
+    plain = tracked_result(model, stretch, slide)
+    assert with_discretisation(plain, ParameterErrors.of(model)) is plain
+    found = with_discretisation(plain, ParameterErrors.of(certified))
+
+    def size(mu):
+        return np.sqrt(np.mean(np.sum(displacement(model, mu) ** 2, axis=1)))
+
+    errors = (MEANT - STATES) * (size([stretch, slide]) / np.array([size(meant) for meant in MEANT]))[:, None]
+    expected = plain.covariance.copy()
+    expected[:2, :2] += errors.T @ errors / 2.0
+    assert found.covariance == pytest.approx(expected, rel=1e-9)
+    at_rest = with_discretisation(tracked_result(model, 0.0, 0.0), ParameterErrors.of(certified))
+    assert at_rest.covariance == pytest.approx(plain.covariance, rel=1e-9)
+
+
+def test_a_known_parameter_gets_no_deviation(model, certified):
+    plain = tracked_result(model, 0.06, 0.004)
+    covariance = plain.covariance.copy()
+    covariance[1, :] = covariance[:, 1] = 0.0
+    known = replace(plain, estimate=replace(plain.estimate, covariance=covariance))
+    found = with_discretisation(known, ParameterErrors.of(certified)).covariance
+    assert found[0, 0] > covariance[0, 0]
+    assert not found[1].any()
