@@ -54,7 +54,8 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
         raise SourceError(f"frames {first}-{last} of {path}: the last frame is before the first")
     for matches, open_kind in _KINDS:
         if matches(path):
-            return _checked(open_kind(path, first, last), path)
+            stream = open_kind(path, first, last)
+            return stream if open_kind in _BUILT_IN else _checked(stream, path)
     raise SourceError(
         f"there is no folder of images and no video at {path} (cameras are webcam:0, /dev/video0 or a URL)"
     )
@@ -121,3 +122,5 @@ register_source(is_tum, tum_recording)
 register_source(is_bag, RosBag)
 register_source(is_camera, open_camera)
 register_source(Path.is_socket, open_socket)
+#: What these open is what it should be, with more than all sources have.
+_BUILT_IN = frozenset(open_kind for _, open_kind in _KINDS)

@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 #: A sample is given up after so many attempts from different neighbours.
 MOST_ATTEMPTS = 2
 FIRST_FAILURE = (
-    "a sample could not be solved: {}. The others are tried, which may take long; if fewer than half of all can be "
-    "solved, there will be no model. {}"
+    "note: a sample was not solved at the first attempt: {}. It is tried again from another one. There is no model "
+    "if fewer than half of the samples can be solved. {}"
 )
 #: Steps and paths that differ by less, relatively, are equally long: rounding decides nothing.
 TIE = 1e-9
