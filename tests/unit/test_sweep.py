@@ -97,7 +97,9 @@ def test_the_first_failure_is_said_before_anything_else_is_tried(monkeypatch, tm
     with pytest.raises(StudyError, match="only 1 of 4"):
         sweep.run_sweep(STUDY, row([0.006, 0.012, 0.016, 0.02]), tmp_path, SerialExecutor())
     said.append(capsys.readouterr().err)
-    telling = [number for number, text in enumerate(said) if "not solved at the first attempt: no equilibrium. " in text]
+    telling = [
+        number for number, text in enumerate(said) if "not solved at the first attempt: no equilibrium. " in text
+    ]
     assert telling == [2], "the second of all attempts fails, and no later failure is told"
     assert STUDY.advice in said[2]
 
