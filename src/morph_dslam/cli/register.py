@@ -1,16 +1,9 @@
 """`morph register`: an undeformed object in the map of a scene."""
 
-from __future__ import annotations
-
 import argparse
-from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_repeated, positive_number, region
-
-if TYPE_CHECKING:
-    from morph_dslam import Registration
 
 HELP = "find an undeformed object in the map of a scene, and the size of the map's unit"
 KEPT = "nothing was written"
@@ -47,7 +40,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Register the object and print how well it fits."""
-    from morph_dslam.extend.registration import run_registration
+    from morph_dslam.extend.registration import registration_line, run_registration
 
     registration = run_registration(
         arguments.map,
@@ -67,20 +60,4 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"note: {note}")
     picture = "" if arguments.board else " and registration.jpg"
     print(f"wrote {arguments.output / 'registration.json'}{picture}")
-    print(_line(registration))
-
-
-def _line(registration: Registration) -> str:
-    """The size of the map's unit, and how well the place is known.
-
-    Scores are left out: those of two searches, with hints and without, measure different things.
-    """
-    facts, deviations = registration.facts, registration.pose_deviations()
-    agreement = "none" if facts["rms_px"] is None else f"{facts['rms_px']:.3f}"
-    place, angle = (
-        ("unknown",) * 2 if deviations is None else (f"{1e3 * deviations[0]:.2f}", f"{degrees(deviations[1]):.2f}")
-    )
-    return (
-        f"map_units_per_metre={facts['map_units_per_metre']:.6g} rms_px={agreement} place_std_mm={place} "
-        f"angle_std_deg={angle} ambiguous={'yes' if registration.ambiguous else 'no'}"
-    )
+    print(registration_line(registration))

@@ -1,4 +1,4 @@
-"""Files that cannot be written: whoever asked for them is told which one it is, and no half of it stays."""
+"""Files that cannot be written: the message names the file, and no half of it stays."""
 
 from __future__ import annotations
 

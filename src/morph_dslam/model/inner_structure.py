@@ -6,7 +6,6 @@ nothing to the mechanics: a stiff inclusion belongs into the solid's own mesh.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.errors import ModelFileError
+from morph_dslam.errors import ModelFileError, refusal
+from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.model.field_storage import read_array, read_text
 from morph_dslam.model.reduced_model import MaterialPoints, ReducedModel
 from morph_dslam.model.separated import SeparatedField
@@ -87,14 +87,12 @@ class InnerStructure:
 def save_inner_structure(path: Path, structure: InnerStructure) -> None:
     """Write a file that `load_inner_structure` reads."""
     try:
-        with h5py.File(path, "w") as file:
+        with written_hdf5(path) as file:
             file.attrs.update({"format": FORMAT, "version": VERSION, "name": structure.name})
             file["rest"], file["triangles"] = structure.rest, structure.triangles
             file["corners"], file["weights"] = structure.points.corners, structure.points.weights
     except OSError as error:
-        # The library's own message is of several lines.
-        reason = os.strerror(error.errno) if error.errno else "is the disk full?"
-        raise ModelFileError(f"cannot write the inner structure {path}: {reason}") from error
+        raise ModelFileError(f"cannot write the inner structure {refusal(error, path)}") from error
 
 
 def load_inner_structure(path: Path) -> InnerStructure:

@@ -311,16 +311,18 @@ def _load_beside(path: Path, map_path: Path) -> Registration:
 
 
 def registration_line(registration: Registration) -> str:
-    """The line that sums up a registration in a map."""
+    """The size of the map's unit, and how well the place is known.
+
+    Scores are left out: those of two searches, with hints and without, measure different things.
+    """
     facts: dict[str, Any] = registration.facts
     agreement = "none" if facts["rms_px"] is None else f"{facts['rms_px']:.3f}"
     deviations = registration.pose_deviations()
     stated = "unknown" if deviations is None else f"{1e3 * deviations[0]:.2f}"
     angle = "unknown" if deviations is None else f"{np.degrees(deviations[1]):.2f}"
     return (
-        f"map_units_per_metre={facts['map_units_per_metre']:.6g} score={facts['score']:.0f} "
-        f"runner_up={facts['runner_up_score']:.0f} explained={facts['n_explained']} rms_px={agreement} "
-        f"place_std_mm={stated} angle_std_deg={angle} ambiguous={'yes' if registration.ambiguous else 'no'}"
+        f"map_units_per_metre={facts['map_units_per_metre']:.6g} rms_px={agreement} place_std_mm={stated} "
+        f"angle_std_deg={angle} ambiguous={'yes' if registration.ambiguous else 'no'}"
     )
 
 

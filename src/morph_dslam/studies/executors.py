@@ -80,7 +80,8 @@ class _WorkerProcesses(ProcessPoolExecutor):
     def __init__(self, count: int, runs_main: bool) -> None:
         context = multiprocessing.get_context("spawn") if runs_main else _BareContext()
         self._started = context.RawValue("b", 0)  # without a lock, which a worker that is killed could hold
-        laws = _laws() if _can_be_sent(_laws()) else {}
+        laws = _laws()
+        laws = {} if _sent(laws) is None else laws
         super().__init__(count, mp_context=context, initializer=_start_worker, initargs=(self._started, laws))
         self.slots = 2 * count
         self._others = set(multiprocessing.active_children())
@@ -133,18 +134,18 @@ def _laws() -> dict[str, Any]:
     return {name: law for name, law in laws.items() if not law.__module__.startswith("morph_dslam.")}
 
 
-def _can_be_sent(item: object) -> bool:
+def _sent(item: object) -> bytes | None:
+    """What is sent to a worker for it; None if it cannot be."""
     try:
-        pickle.dumps(item)
+        return pickle.dumps(item)
     except (pickle.PicklingError, AttributeError, TypeError):
-        return False
-    return True
+        return None
 
 
 def needs_main(study: object) -> bool:
     """Whether workers must run the main program's file: it defines what a study or a law is made of."""
-    sent = (study, _laws())
-    return not _can_be_sent(sent) or b"__main__" in pickle.dumps(sent)
+    sent = _sent((study, _laws()))
+    return sent is None or b"__main__" in sent
 
 
 @contextmanager

@@ -118,8 +118,8 @@ def _with_systematic_errors(
 def with_discretisation(result: FrameResult, errors: ParameterErrors | None) -> FrameResult:
     """The result with the error of the model's mesh in the deviations of its parameters.
 
-    It is the same in frames alike, so that no frame is weighed by it: only what is told of a frame has it. Parameters
-    that are known do not get one.
+    It is the same in frames alike, so that it weighs no frame against another: only results have it. Known parameters
+    do not get one.
     """
     estimate = result.estimate
     if errors is None or estimate is None:
