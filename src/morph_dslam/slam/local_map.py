@@ -5,7 +5,7 @@ The adjustment is gathered from the map, solved apart from it, and put back; a t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -192,6 +192,11 @@ class MapProblem:
             iterations=self.iterations,
             tolerance=TOLERANCE,
         )
+
+    def after(self, result: Adjustment, iterations: int) -> MapProblem:
+        """The same from where some iterations have led, with so many more to come."""
+        poses, points = result.camera_from_world, result.points
+        return replace(self, camera_from_world=poses, positions=points, iterations=iterations)
 
     def errors(self, camera_from_world: Array, positions: Array) -> Array:
         """Distances (o,) in pixels between the observations and the projected points."""

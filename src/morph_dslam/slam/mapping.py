@@ -124,8 +124,8 @@ def redundancy(rigid_map: RigidMap, numbers: Indices) -> NDArray[np.float64]:
 
 #: Map points that are found in a smaller share of the frames that should show them are taken out.
 LEAST_FOUND = 0.1
-#: Iterations of local bundle adjustment.
-LOCAL_ITERATIONS = 10
+#: Iterations of local bundle adjustment, and after how many of them it pauses.
+LOCAL_ITERATIONS, LOCAL_PAUSE = 10, 3
 
 
 class Mapper:
@@ -154,7 +154,7 @@ class Mapper:
             scaled[:3, 3] *= scale
             velocity[3:] *= scale
             self._map.add_keyframe(Keyframe.of_view(view.frame, scaled, Followed(ids.copy(), view.pixels), velocity))
-        self._adjust_locally()
+        do_all(self._adjust_locally())
         self._add_corners(2, start.views[2].frame)
         for keyframe, view in zip(self._map.keyframes, start.views, strict=True):
             do_all(keyframe.describe(view.frame.grey))
@@ -171,7 +171,7 @@ class Mapper:
         return self._choice.wants(tracked, frame_index)
 
     def insert(self, tracked: Tracked, view: FrameView) -> Work:
-        """Keep a view: its points and the adjustment, then new corners, then its description.
+        """Keep a view: its points, then the adjustment, then new corners, then its description.
 
         Points that have left the rigid scene are taken out: when an object comes back to where it was, its
         points must not hold the camera.
@@ -183,7 +183,8 @@ class Mapper:
         self._points.place_by_depth(number, view.depth)
         self._points.triangulate(number)
         self._points.fuse(number)
-        self._adjust_locally()
+        yield
+        yield from self._adjust_locally()
         self._cull()
         yield
         cull_keyframes(self._map)
@@ -193,7 +194,9 @@ class Mapper:
 
     def adjust_all(self, iterations: int = 20) -> None:
         """Bundle adjustment of the whole map."""
-        self._adjust(self._map.kept_keyframes, np.empty(0, dtype=np.int64), iterations)
+        none = np.empty(0, dtype=np.int64)
+        problem = gather(self._map, self._camera, self._map.kept_keyframes, none, iterations, self._hold_poses)
+        put_back(self._map, problem, problem.solve())
 
     def complete(self) -> Moves:
         """Measure all points again, and adjust the whole map to that; by how much they moved in its keyframes."""
@@ -214,14 +217,15 @@ class Mapper:
         self._points.place_by_depth(number, view.depth)
         self._choice.kept(number, view.index)
 
-    def _adjust_locally(self) -> None:
+    def _adjust_locally(self) -> Work:
         """Bundle adjustment of the newest keyframes that see the same points, held by others that do."""
         window, holders = local_window(self._map)
-        self._adjust(window, holders, LOCAL_ITERATIONS)
-
-    def _adjust(self, free: Indices, fixed: Indices, iterations: int) -> None:
-        problem = gather(self._map, self._camera, free, fixed, iterations, self._hold_poses)
-        put_back(self._map, problem, problem.solve())
+        problem = gather(self._map, self._camera, window, holders, LOCAL_PAUSE, self._hold_poses)
+        result = problem.solve()
+        if result.iterations == LOCAL_PAUSE:
+            yield
+            result = problem.after(result, LOCAL_ITERATIONS - LOCAL_PAUSE).solve()
+        put_back(self._map, problem, result)
 
     def _cull(self) -> None:
         """Take out map points that are hardly ever found where they should be."""
