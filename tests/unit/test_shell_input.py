@@ -74,7 +74,7 @@ def test_a_study_of_a_surface_with_a_branch_ends_with_one_message(tmp_path, caps
         ({"material": {"young": "1 GPa", "poisson": 0.3, "fibre": [0, 0, 0]}}, "no direction"),
         ({"loads": [{"kind": "gravity"}]}, "gravity needs the material's density"),
         ({"loads": [{"kind": "edge", "on": "x_max", "force": ["1 N", "0 N/m", "0 N/m"]}]}, "not a unit of force per"),
-        ({"sets": {"tip": {}}}, "either box or nearest"),
+        ({"sets": {"tip": {}}}, "either nearest, or a region"),
         ({"mesh": {"file": "sheet.vtu", "unit": "m", "size": "1 mm"}}, "size"),
         ({"shell": {"thickness": "1 mm * part"}}, "part"),
         ({"shell": {"thickness": "1 mm * a"}}, "thickness = 0 mm must be positive where a = 0: change its range"),

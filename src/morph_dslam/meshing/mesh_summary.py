@@ -36,6 +36,16 @@ def faces_figures(mesh: Mesh, faces: Indices) -> tuple[float, Array, Array]:
     return area, areas @ corners.mean(axis=1) / area, halves.sum(axis=0) / area
 
 
+def unit_normals(mesh: Mesh, faces: Indices) -> Array:
+    """Mean normals (f, 3) of faces (f, 2), of length one, outwards of solids."""
+    nodes = mesh.face_nodes(faces, corners_only=True)
+    corners = mesh.nodes[nodes]
+    # Half the cross product of the diagonals is the vector area, of a triangle too if it repeats its last corner.
+    last = np.where((nodes[:, -1] >= 0)[:, None], corners[:, -1], corners[:, 2])
+    normals = np.cross(corners[:, 2] - corners[:, 0], last - corners[:, 1])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
 def set_rows(mesh: Mesh) -> list[list[str]]:
     """A row of `SET_COLUMNS` for each surface, node set and cell set, each kind in the order of names.
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model.cell_types import CellType, cell_type
@@ -262,6 +264,31 @@ def end_surfaces(mesh: Mesh) -> dict[str, Indices]:
             away = np.nanmax(np.abs(points[:, :, axis] - end), axis=1)
             found[f"{letter}_{name}"] = faces[away <= AT_END * (high[axis] - low[axis])]
     return {name: ends for name, ends in found.items() if len(ends)}
+
+
+def with_cavities(mesh: Mesh) -> Mesh:
+    """A solid mesh with the walls of its closed cavities as surfaces "cavity_1", ..., in the order of their centres.
+
+    Centres are ordered along x, then y, then z. Names that the mesh has already stay what they are.
+    """
+    if any(block.type.dimension == 2 for block in mesh.blocks) or not mesh.n_cells:
+        return mesh
+    faces = mesh.boundary_faces()
+    nodes = mesh.face_nodes(faces, corners_only=True)
+    pairs = [nodes[nodes[:, k] >= 0][:, [0, k]] for k in range(1, nodes.shape[1])]
+    ends = np.concatenate(pairs).T
+    graph = sparse.coo_array((np.ones(ends.shape[1]), ends), shape=(mesh.n_nodes, mesh.n_nodes))
+    _, labels = csgraph.connected_components(graph, directed=False)
+    of_face, found = labels[nodes[:, 0]], []
+    for label in np.unique(of_face) if len(np.unique(of_face)) > 1 else ():
+        wall = faces[of_face == label]
+        corners = mesh.nodes[mesh.face_triangles(wall)]
+        # A wall that faces inwards bounds less than no volume (divergence theorem).
+        if np.linalg.det(corners).sum() < 0.0:
+            found.append((np.round(corners.mean(axis=(0, 1)) / np.ptp(mesh.nodes), 6).tolist(), wall))
+    found.sort(key=lambda each: each[0])
+    cavities = {f"cavity_{number}": wall for number, (_, wall) in enumerate(found, start=1)}
+    return replace(mesh, surfaces={**cavities, **mesh.surfaces}) if cavities else mesh
 
 
 def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:

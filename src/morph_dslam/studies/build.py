@@ -149,16 +149,14 @@ def _kept_in(output: Path) -> Path:
 def _announce_mesh(study: SolidStudy | ShellStudy) -> None:
     """Print how large the mesh is, for a wrong unit shows there before anything is solved, and which faces were chosen.
 
-    Chosen are those of node sets, or of several sets, that the study names as one surface.
+    Chosen are those of the study's own sets, and of node sets, or of several sets, that it names as one surface.
     """
     mesh = study.solid_mesh() if isinstance(study, SolidStudy) else study.shell_mesh()
     announce(f"mesh: {described_mesh(mesh)}")
     if isinstance(study, SolidStudy):
         for name in mesh.surfaces.keys() - make_mesh(study.mesh).surfaces.keys():
             area, _, _ = faces_figures(mesh, mesh.surfaces[name])
-            announce(
-                f"mesh: the surface {name} is the {len(mesh.surfaces[name])} faces of its sets, {1e6 * area:.4g} mm2"
-            )
+            announce(f"mesh: the surface {name} is {len(mesh.surfaces[name])} faces, {1e6 * area:.4g} mm2")
 
 
 def _unstrained(snapshots: Snapshots) -> list[str]:

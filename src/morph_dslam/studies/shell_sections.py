@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, Literal
 
@@ -148,53 +147,9 @@ SurfaceSection = Annotated[
 ]
 
 
-class SetSection(Section):
-    """Nodes by their place: all in a ``box``, given by two of its corners, or the one ``nearest`` to a point."""
-
-    box: tuple[tuple[Length, Length, Length], tuple[Length, Length, Length]] | None = None
-    nearest: tuple[Length, Length, Length] | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> SetSection:
-        if (self.box is None) == (self.nearest is None):
-            raise ValueError("give either box or nearest")
-        return self
-
-    def nodes(self, points: Array) -> NDArray[np.int64]:
-        """Indices of the nodes, of all (n, 3) in metres.
-
-        StudyError if ``nearest`` is farther away from them than the mesh is long, as a point in a wrong unit is.
-        """
-        if self.nearest is not None:
-            distances, longest = np.linalg.norm(points - self.nearest, axis=1), np.ptp(points, axis=0).max()
-            if distances.min() > longest:
-                raise StudyError(
-                    f"nearest is {1e3 * distances.min():.4g} mm away from the mesh, which is {1e3 * longest:.4g} mm "
-                    "long: give a point near it"
-                )
-            return np.array([np.argmin(distances)])
-        low, high = np.sort(np.array(self.box), axis=0)
-        tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
-        return np.flatnonzero(((points >= low - tolerance) & (points <= high + tolerance)).all(axis=1))
-
-
-def shell_mesh(section: Any, sets: dict[str, SetSection]) -> Mesh:
-    """The checked mesh of a `SurfaceSection` with more node sets; StudyError if one of these is empty or known.
-
-    It is made once, and again when its file has been written again.
-    """
-    mesh = _made(section, file_stamp(section.file) if isinstance(section, _FileSurface) else None)
-    found = {}
-    for name, chosen in sets.items():
-        if name in mesh.node_sets:
-            raise StudyError(f"sets.{name}: the mesh has a set of this name; choose another")
-        try:
-            nodes = found[name] = chosen.nodes(mesh.nodes)
-        except StudyError as error:
-            raise StudyError(f"sets.{name}: {error}") from error
-        if not len(nodes):
-            raise StudyError(f"sets.{name}: no node of the mesh lies in the box; move or widen it")
-    return replace(mesh, node_sets={**mesh.node_sets, **found})
+def shell_mesh(section: Any) -> Mesh:
+    """The checked mesh of a `SurfaceSection`; made once, and again when its file has been written again."""
+    return _made(section, file_stamp(section.file) if isinstance(section, _FileSurface) else None)
 
 
 @lru_cache(maxsize=2)

@@ -25,8 +25,8 @@ from morph_dslam.studies.moving_loads import check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
+from morph_dslam.studies.set_sections import SetSection, with_sets
 from morph_dslam.studies.shell_sections import (
-    SetSection,
     ShellLoadSection,
     ShellMaterialSection,
     ShellSection,
@@ -86,7 +86,7 @@ class ShellStudy(BodyStudy, Section):
 
     def shell_mesh(self) -> Mesh:
         """The mesh with the sets of the study, checked together with those that it names."""
-        return with_named_sets(shell_mesh(self.mesh, self.sets), self._sets())
+        return with_named_sets(with_sets(shell_mesh(self.mesh), self.sets), self._sets())
 
     def _parts(self) -> list[tuple[str, Any]]:
         """Shell, material, supports and loads with what messages call them."""

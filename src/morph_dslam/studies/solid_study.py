@@ -36,6 +36,7 @@ from morph_dslam.studies.moving_loads import check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
+from morph_dslam.studies.set_sections import SetSection, with_sets
 from morph_dslam.studies.shape_sections import ShapeSection, read_shape, shape_fields, shape_fingerprints
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
@@ -82,6 +83,7 @@ class SolidStudy(BodyStudy, Section):
 
     name: str
     mesh: MeshSection
+    sets: dict[str, SetSection] = Field(default_factory=dict)
     materials: dict[str, MaterialSection] = Field(min_length=1)
     supports: tuple[SupportSection, ...] = ()
     loads: tuple[LoadSection, ...] = ()
@@ -196,8 +198,8 @@ class SolidStudy(BodyStudy, Section):
         return self.solver
 
     def solid_mesh(self) -> Mesh:
-        """The mesh, checked together with the sets that the study names."""
-        return with_named_sets(make_mesh(self.mesh), self._sets())  # type: ignore[arg-type]
+        """The mesh with the sets of the study, checked together with those that it names."""
+        return with_named_sets(with_sets(make_mesh(self.mesh), self.sets), self._sets())
 
     def _sets(self) -> Iterator[NamedSet]:
         """The sets that the study names."""

@@ -18,6 +18,7 @@ from morph_dslam.io.text import read_toml
 from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.set_sections import with_sets
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_sections import shell_mesh
 from morph_dslam.studies.shell_study import ShellStudy
@@ -62,7 +63,7 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
 
 
 def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
-    """The mesh of a study file, whatever sets the study names, or of a mesh file.
+    """The mesh of a study file with the sets that it makes, whichever it names, or of a mesh file.
 
     Raises StudyError as `load_study` and `load_mesh`, or if a study has no mesh.
 
@@ -76,9 +77,9 @@ def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
         return load_mesh(path, unit, None if size is None else to_si(size, unit, "length"))
     study = load_study(path)
     if isinstance(study, SolidStudy):
-        return make_mesh(study.mesh)
+        return with_sets(make_mesh(study.mesh), study.sets)
     if isinstance(study, ShellStudy):
-        return shell_mesh(study.mesh, study.sets)
+        return with_sets(shell_mesh(study.mesh), study.sets)
     raise StudyError(f"{path} has no [mesh]: sheets in grips and solutions of other programs have no sets to name")
 
 

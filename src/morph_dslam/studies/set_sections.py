@@ -1,0 +1,167 @@
+"""The [sets.NAME] sections of a study: what lies in a region of the mesh, by a name that other sections use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.mesh_summary import unit_normals
+from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.studies.sections import JOINED, Angle, Length, Number, PositiveLength, Section, SetName
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+#: Normals this far from a direction face it, unless a set says otherwise, rad.
+FACING_ANGLE = np.pi / 4.0
+#: Nodes this far outside of a box, as a part of the mesh's length, still lie in it.
+TOLERANCE = 1e-9
+
+
+class SetSection(Section):
+    """What lies in a region: its nodes, the outer faces all of whose nodes lie in it, and the cells whose middles do.
+
+    A ``box`` is given by two opposite corners, a ball by the point ``near`` which it is and its ``radius``. ``facing``
+    leaves the faces whose outward normal is at most ``angle`` (45 degrees if absent) from a direction, ``of`` those of
+    a surface, or of several listed (of shells: cell sets); then the nodes are those of the faces. All that is given
+    holds together. ``nearest`` alone is the one node nearest to a point.
+    """
+
+    box: tuple[tuple[Length, Length, Length], tuple[Length, Length, Length]] | None = None
+    near: tuple[Length, Length, Length] | None = None
+    radius: PositiveLength | None = None
+    facing: tuple[Number, Number, Number] | None = None
+    angle: Annotated[Angle, Field(gt=0.0, le=np.pi)] | None = None
+    of: SetName | None = None
+    nearest: tuple[Length, Length, Length] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> SetSection:
+        regions = (self.box, self.near, self.facing, self.of)
+        if (self.nearest is None) == all(region is None for region in regions):
+            raise ValueError("give either nearest, or a region: any of box, near with radius, facing, of")
+        if (self.near is None) != (self.radius is None):
+            raise ValueError("near and radius belong together: give both, or neither")
+        if self.angle is not None and self.facing is None:
+            raise ValueError("angle is that between normals and facing: give facing too, a direction")
+        if self.facing is not None and not np.any(self.facing):
+            raise ValueError("facing has no length: give a direction, [0, 0, 1] say")
+        return self
+
+    @property
+    def chooses_faces(self) -> bool:
+        """Whether it is made of faces, not of all that lies in a part of space."""
+        return self.facing is not None or self.of is not None
+
+    def holds(self, points: Array, length: float) -> Mask:
+        """Which of some points (n, 3), metres, lie in box and ball; ``length`` is the mesh's."""
+        inside = np.ones(len(points), dtype=bool)
+        if self.box is not None:
+            low, high = np.sort(np.array(self.box), axis=0)
+            tolerance = TOLERANCE * length
+            inside &= ((points >= low - tolerance) & (points <= high + tolerance)).all(axis=1)
+        if self.near is not None and self.radius is not None:
+            inside &= np.linalg.norm(points - np.array(self.near), axis=1) <= self.radius + TOLERANCE * length
+        return inside
+
+    def add_to(self, mesh: Mesh, name: str) -> Mesh:
+        """The mesh with this set by a name. Raises StudyError if nothing of the mesh is in it."""
+        length = float(np.ptp(mesh.nodes, axis=0).max())
+        if self.nearest is not None:
+            return _with(mesh, name, nodes=_nearest(mesh.nodes, np.array(self.nearest), length))
+        inside = self.holds(mesh.nodes, length)
+        if not inside.any():
+            raise StudyError(f"no node of the mesh lies in it; move or widen it: {self._missed(mesh.nodes)}")
+        faces = self._faces(mesh, inside)
+        if self.chooses_faces:
+            if not len(faces):
+                raise StudyError(f"no {_face_word(mesh)} of the mesh has all its nodes in there and faces so; widen it")
+            nodes = mesh.face_nodes(faces)
+            return _with(mesh, name, faces, np.unique(nodes[nodes >= 0]))
+        middles = np.concatenate([mesh.nodes[block.connectivity].mean(axis=1) for block in mesh.blocks])
+        cells = np.flatnonzero(self.holds(middles, length))
+        return _with(mesh, name, faces, np.flatnonzero(inside), cells)
+
+    def _faces(self, mesh: Mesh, inside: Mask) -> Indices:
+        """Outer faces (f, 2) all of whose nodes are ``inside`` (n,), and that face as they should."""
+        if self.of is None:
+            faces = mesh.boundary_faces()
+        else:
+            faces = np.unique(np.concatenate([_faces_named(mesh, part) for part in self.of.split(JOINED)]), axis=0)
+        nodes = mesh.face_nodes(faces)
+        faces = faces[(inside[nodes] | (nodes < 0)).all(axis=1)]
+        if self.facing is None or not len(faces):
+            return faces
+        direction = np.array(self.facing) / np.linalg.norm(self.facing)
+        angle = FACING_ANGLE if self.angle is None else self.angle
+        return faces[unit_normals(mesh, faces) @ direction >= np.cos(angle) - TOLERANCE]
+
+    def _missed(self, nodes: Array) -> str:
+        """Where the mesh lies, and how far from a ball, in words."""
+        low, high = 1e3 * nodes.min(axis=0), 1e3 * nodes.max(axis=0)
+        spans = ", ".join(f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+        away = ""
+        if self.near is not None:
+            away = f", and is {1e3 * np.linalg.norm(nodes - np.array(self.near), axis=1).min():.4g} mm away from near"
+        return f"the mesh has {spans} mm{away}"
+
+
+def with_sets(mesh: Mesh, sets: Mapping[str, SetSection]) -> Mesh:
+    """The mesh with the sets of a study. Raises StudyError if one of them is empty, or the mesh has one of its name."""
+    for name in sets:
+        if name == "all" or any(name in known for known in (mesh.node_sets, mesh.cell_sets, mesh.surfaces)):
+            raise StudyError(f"sets.{name}: the mesh has a set of this name; choose another")
+    for name, section in sets.items():
+        try:
+            mesh = section.add_to(mesh, name)
+        except StudyError as error:
+            raise StudyError(f"sets.{name}: {error}") from error
+    return mesh
+
+
+def _is_sheet(mesh: Mesh) -> bool:
+    return all(block.type.dimension == 2 for block in mesh.blocks)
+
+
+def _face_word(mesh: Mesh) -> str:
+    return "cell" if _is_sheet(mesh) else "outer face"
+
+
+def _faces_named(mesh: Mesh, name: str) -> Indices:
+    """Faces (f, 2) of a surface, of sheets those of a cell set. Raises StudyError if there is none of this name."""
+    if not _is_sheet(mesh):
+        return mesh.faces_in(name)
+    cells = mesh.cells(name)
+    return np.column_stack([cells, np.zeros_like(cells)])
+
+
+def _nearest(nodes: Array, point: Array, length: float) -> Indices:
+    """The node nearest to a point (3,), which StudyError refuses farther away than the mesh is long: a wrong unit."""
+    distances = np.linalg.norm(nodes - point, axis=1)
+    if distances.min() > length:
+        raise StudyError(
+            f"nearest is {1e3 * distances.min():.4g} mm away from the mesh, which is {1e3 * length:.4g} mm "
+            "long: give a point near it"
+        )
+    return np.array([np.argmin(distances)])
+
+
+def _with(
+    mesh: Mesh, name: str, faces: Indices | None = None, nodes: Indices | None = None, cells: Indices | None = None
+) -> Mesh:
+    """The mesh with what a set holds; a sheet's faces are its cells. What is empty is no set."""
+    if _is_sheet(mesh) and cells is None and faces is not None:
+        cells = faces[:, 0]
+    surfaces = {name: faces} if faces is not None and len(faces) and not _is_sheet(mesh) else {}
+    return replace(
+        mesh,
+        surfaces={**mesh.surfaces, **surfaces},
+        node_sets={**mesh.node_sets, **({name: nodes} if nodes is not None and len(nodes) else {})},
+        cell_sets={**mesh.cell_sets, **({name: cells} if cells is not None and len(cells) else {})},
+    )

@@ -1,0 +1,177 @@
+"""Sets that a study makes by their place: areas, volumes and numbers in closed form, and what cannot be."""
+
+import meshio
+import numpy as np
+import pytest
+import trimesh
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.mesh_summary import faces_figures
+from morph_dslam.studies.study import make_study
+
+#: A block of 40 x 20 x 10 mm in cells of 5 mm, held and loaded by sets of its own.
+BLOCK = {
+    "name": "block",
+    "mesh": {"generator": "block", "size": ["40 mm", "20 mm", "10 mm"], "divisions": [8, 4, 2], "cells": "hex20"},
+    "materials": {"rubber": {"law": "neo_hookean", "young": "1 MPa", "poisson": "0.4"}},
+    "supports": [{"kind": "fixed", "on": "x_min"}],
+    "loads": [{"kind": "pressure", "on": "z_max", "pressure": "p"}],
+    "parameters": {"p": {"range": ["0 kPa", "10 kPa"]}},
+}
+
+
+def mm(*values):
+    return [f"{value} mm" for value in values]
+
+
+def mesh_with(**section):
+    return make_study(BLOCK | {"sets": {"chosen": section}}).solid_mesh()
+
+
+def area(mesh, name="chosen"):
+    return faces_figures(mesh, mesh.surface(name))[0]
+
+
+def test_a_box_holds_nodes_faces_and_cells():
+    mesh = mesh_with(box=[mm(-1, -1, -1), mm(10, 21, 11)])
+    # Two of eight slices: all sides of the first 10 mm but for the cut.
+    assert area(mesh) == pytest.approx(1e-6 * (20 * 10 + 2 * 10 * 20 + 2 * 10 * 10))
+    assert len(mesh.cells("chosen")) == 2 * 4 * 2
+    np.testing.assert_array_equal(mesh.set_nodes("chosen"), np.flatnonzero(mesh.nodes[:, 0] < 0.0101))
+
+
+def test_the_corners_of_a_box_may_come_in_any_order():
+    first, second = (mesh_with(box=box) for box in ([mm(0, 0, 0), mm(10, 20, 10)], [mm(10, 0, 10), mm(0, 20, 0)]))
+    np.testing.assert_array_equal(first.set_nodes("chosen"), second.set_nodes("chosen"))
+
+
+def test_a_ball_holds_what_is_within_its_radius():
+    centre = np.array([0.02, 0.01, 0.01])
+    mesh = mesh_with(near=mm(20, 10, 10), radius="7.2 mm", of="z_max")
+    # Of the 5 mm squares of the top, the four that meet at the centre: their far corners are 7.07 mm away.
+    assert area(mesh) == pytest.approx(1e-4)
+    assert np.linalg.norm(mesh.nodes[mesh.set_nodes("chosen")] - centre, axis=1).max() == pytest.approx(0.005 * 2**0.5)
+    assert "chosen" not in mesh.cell_sets
+
+
+@pytest.mark.parametrize(("angle", "sides"), [("1 deg", ["x_max"]), ("46 deg", ["x_max", "z_max"])])
+def test_faces_that_face_a_direction(angle, sides):
+    """(1, 0, 0.9) is 42 degrees from x and 48 from z; turned to (1, 0, 1) it is 45 from both."""
+    direction = [1, 0, 0] if len(sides) == 1 else [1, 0, 1]
+    mesh = mesh_with(facing=direction, angle=angle)
+    assert area(mesh) == pytest.approx(sum(area(mesh, side) for side in sides))
+
+
+def test_a_share_of_a_cylinder_faces_a_direction():
+    tube = {"generator": "tube", "inner_radius": "8 mm", "outer_radius": "10 mm", "length": "30 mm"}
+    tube |= {"divisions": [3, 1, 72], "cells": "hex20"}
+    content = BLOCK | {"mesh": tube, "supports": [{"kind": "fixed", "on": "bottom"}]}
+    content["loads"] = [{"kind": "pressure", "on": "window", "pressure": "p"}]
+    sets = {"window": {"facing": [0, 1, 0], "angle": "30.1 deg", "of": "outer"}}
+    mesh = make_study(content | {"sets": sets}).solid_mesh()
+    # 60 of 360 degrees of the outer wall, in whole faces of 5 degrees.
+    assert area(mesh, "window") == pytest.approx(2 * np.pi * 0.01 * 0.03 / 6, rel=2e-3)
+
+
+def test_of_takes_earlier_sets_and_several():
+    sets = {
+        "half": {"box": [mm(0, 0, 0), mm(20, 20, 10)]},
+        "quarter": {"of": ["half"], "box": [mm(0, 0, 0), mm(20, 10, 10)], "facing": [0, 0, 1]},
+        "ends": {"of": ["x_min", "x_max"]},
+    }
+    mesh = make_study(BLOCK | {"sets": sets}).solid_mesh()
+    assert area(mesh, "quarter") == pytest.approx(2e-4)
+    assert area(mesh, "ends") == pytest.approx(4e-4)
+
+
+def test_loads_supports_and_materials_take_them():
+    soft = {"law": "neo_hookean", "young": "0.1 MPa", "poisson": "0.4", "on": "core"}
+    content = BLOCK | {
+        "sets": {"core": {"near": mm(20, 10, 5), "radius": "8 mm"}, "held": {"box": [mm(0, 0, 0), mm(4, 20, 10)]}},
+        "materials": BLOCK["materials"] | {"soft": soft},
+        "supports": [{"kind": "fixed", "on": "held"}],
+    }
+    study = make_study(content)
+    # The middles of 5 mm cells that are within 8 mm of the centre: (2.5, 2.5, 2.5) and (7.5, 2.5, 2.5) is 8.29 away.
+    assert len(study.solid_mesh().cells("core")) == 8
+    assert (
+        study.fingerprint() != make_study(content | {"sets": content["sets"] | {"more": {"of": "z_min"}}}).fingerprint()
+    )
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({}, "sets.chosen: give either nearest, or a region"),
+        ({"nearest": mm(0, 0, 0), "box": [mm(0, 0, 0), mm(1, 1, 1)]}, "give either nearest, or a region"),
+        ({"near": mm(0, 0, 0)}, "near and radius belong together"),
+        ({"of": "z_max", "angle": "10 deg"}, "give facing too"),
+        ({"facing": [0, 0, 0]}, "facing has no length"),
+        ({"facing": [0, 0, 1], "angle": "0 deg"}, "greater than 0"),
+        ({"box": [mm(0, 0, 20), mm(1, 1, 30)]}, "no node of the mesh lies in it; .* z 0 to 10 mm"),
+        ({"near": mm(20, 10, 25), "radius": "7 mm"}, "is 15 mm away from near"),
+        ({"facing": [0, 0, 1], "box": [mm(1, 1, 0), mm(39, 19, 5)]}, "no outer face of the mesh has all its nodes"),
+        ({"of": "z_top"}, "sets.chosen: the mesh has no surface 'z_top'"),
+        ({"nearest": ["20 m", "0 m", "0 m"]}, "nearest is .* mm away from the mesh"),
+    ],
+)
+def test_sets_that_cannot_be(section, message):
+    with pytest.raises(StudyError, match=message):
+        mesh_with(**section)
+
+
+@pytest.mark.parametrize("name", ["z_max", "all"])
+def test_a_name_that_the_mesh_has(name):
+    with pytest.raises(StudyError, match=f"sets.{name}: the mesh has a set of this name"):
+        make_study(BLOCK | {"sets": {name: {"of": "z_min"}}}).solid_mesh()
+
+
+def test_a_load_on_a_set_without_a_whole_face():
+    content = BLOCK | {"sets": {"spot": {"nearest": mm(20, 10, 10)}}}
+    content["loads"] = [{"kind": "pressure", "on": "spot", "pressure": "p"}]
+    with pytest.raises(StudyError, match="load 1: on: 'spot' is a node set that holds no whole face"):
+        make_study(content).solid_mesh()
+
+
+def test_closed_cavities_are_surfaces(tmp_path):
+    """A box with two balls in it, of which the smaller lies at the smaller x."""
+    balls = [trimesh.creation.icosphere(2, radius) for radius in (3.0, 4.0)]
+    for ball, x in zip(balls, (7.0, 22.0), strict=True):
+        ball.apply_translation([x, 5.0, 5.0])
+        ball.invert()
+    box = trimesh.creation.box([30.0, 10.0, 10.0])
+    box.apply_translation([15.0, 5.0, 5.0])
+    trimesh.util.concatenate([box.subdivide().subdivide(), *balls]).export(tmp_path / "hollow.stl")
+    mesh = load_mesh(tmp_path / "hollow.stl", "mm")
+    for name, ball in (("cavity_1", balls[0]), ("cavity_2", balls[1])):
+        size, centre, _ = faces_figures(mesh, mesh.surface(name))
+        assert size == pytest.approx(1e-6 * ball.area, rel=1e-6)
+        np.testing.assert_allclose(centre, 1e-3 * ball.centroid, atol=1e-6)
+    assert "cavity_3" not in mesh.surfaces
+
+
+def test_a_body_without_cavities_has_none(tmp_path):
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [5, 0, 0], [6, 0, 0], [5, 1, 0], [5, 0, 1.0]])
+    meshio.Mesh(points, [("tetra", np.arange(8).reshape(2, 4))]).write(tmp_path / "two.vtu")
+    assert not load_mesh(tmp_path / "two.vtu", "mm").surfaces
+
+
+def test_a_shell_has_cells_for_faces():
+    shell = {
+        "name": "dome",
+        "mesh": {"generator": "sphere", "radius": "50 mm", "polar_angles": ["0 deg", "90 deg"], "divisions": [18, 36]},
+        "shell": {"thickness": "1 mm"},
+        "material": {"young": "1 MPa", "poisson": 0.3},
+        "sets": {"cap": {"facing": [0, 0, 1], "angle": "30.1 deg"}, "side": {"box": [mm(0, -51, 0), mm(51, 51, 51)]}},
+        "supports": [{"kind": "clamped", "on": "rim"}],
+        "loads": [{"kind": "pressure", "on": "cap", "pressure": "p"}],
+        "parameters": {"p": {"range": ["0 Pa", "10 Pa"]}},
+    }
+    mesh = make_study(shell).shell_mesh()
+    sizes = {name: np.column_stack([mesh.cells(name), np.zeros_like(mesh.cells(name))]) for name in ("cap", "side")}
+    # Caps of a sphere: 2 pi R^2 (1 - cos 30 degrees); half of the hemisphere.
+    assert faces_figures(mesh, sizes["cap"])[0] == pytest.approx(
+        2 * np.pi * 0.05**2 * (1 - np.cos(np.pi / 6)), rel=0.01
+    )
+    assert faces_figures(mesh, sizes["side"])[0] == pytest.approx(np.pi * 0.05**2, rel=0.03)
