@@ -17,13 +17,18 @@ from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.sources import open_source
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
-from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.known_state import LandmarkTerm
+from morph_dslam.tracking.outcomes import Rejection, RejectionReason
+from morph_dslam.tracking.patches import normalize_contrast
+from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.session import Session
-from morph_dslam.tracking.still import StillFit, StillProblem, fit_still
+from morph_dslam.tracking.still import StillFit, StillProblem, fit_still, held
 from morph_dslam.tracking.still_notices import FocalLengthEstimated, FocalLengthFarFromGiven, still_notices
 from morph_dslam.tracking.still_run import OpenedSurface
+from morph_dslam.tracking.views import ActiveView
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import UPRIGHT, SheetFilm, mean_error, write_recording
 from tests.support.tracked_rig import placed_objects
@@ -226,6 +231,25 @@ def test_where_an_earlier_pass_found_the_surface_open_is_kept_frame_by_frame(rec
     session = Session({"sheet": placed.new_tracker()}, frames, reregistration={"sheet": known})
     found = [[jump.size for jump in tracked.results["sheet"].jumps] for tracked in session]
     assert found == [[]] * 9 + [[small.size]] * 3 + [[large.size]] * 4
+
+
+def test_an_object_that_is_found_by_its_features_keeps_the_pose():
+    """The camera is believed to be 6 % longer than it is, so that a free pose would leave the one that is held."""
+    model, camera = bent_sheet_model(43, 31), replace(CAMERA, distortion=())
+    film, given = SheetFilm(model, camera), replace(camera, fx=1.06 * camera.fx, fy=1.06 * camera.fy)
+    at_rest, bent = State(model.default, POSE), state(0.55)
+    greys = [cv2.cvtColor(film.frame(shape), cv2.COLOR_BGR2GRAY) for shape in (at_rest, bent)]
+    rest, picture = (Image(grey, normalize_contrast(grey)) for grey in greys)
+    estimator, options = Estimator(model, given, EstimationOptions()), md.TrackerOptions(pose="still")
+    view = ActiveView.of(ReferenceView(estimator, [PosedImage(rest, at_rest)], options), estimator, options)
+    lost = Rejection(RejectionReason.FEW_FEATURES, 0)
+    found, why = view.recovery.recover(picture, model.default, lost, held(at_rest, estimator))
+    assert why is None
+    pose = found.estimate.state.camera_from_object
+    assert np.abs(rotation_log(pose.rotation @ POSE.rotation.T)).max() < 1e-4
+    assert np.abs(pose.translation - POSE.translation).max() < 1e-4
+    # Its shape is what the longer camera makes of the true one, nearly: in a pose of its own it would be bent less.
+    assert found.estimate.state.parameters[0] == pytest.approx(bent.parameters[0], rel=0.1)
 
 
 def test_live_the_pose_is_estimated_anew_from_more_frames(recording, tmp_path):

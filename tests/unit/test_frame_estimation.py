@@ -138,6 +138,18 @@ def test_constant_velocity_repeats_the_last_motion():
     assert found.camera_from_object.translation[1] == pytest.approx(0.06)
 
 
+def test_constant_velocity_keeps_rotations_rotations():
+    """Rounding in a product of three would be doubled in each of these frames, 2^60 times in all."""
+    before, last = (
+        State(np.zeros(3), RigidTransform(rotation_exp(np.array([0.3, -0.02 * k, 0.1])), np.array([0.0, 0.0, 0.6])))
+        for k in range(2)
+    )
+    for _ in range(60):
+        before, last = last, at_constant_velocity(before, last)
+    rotation = last.camera_from_object.rotation
+    np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+
+
 def test_facts_name_what_is_used_and_nothing_by_default():
     assert temporal_facts(PARAMETERS, TrackerOptions())["temporal_prior"] == "none"
     options = TrackerOptions(

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
-from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.timing import stage
@@ -34,7 +33,7 @@ from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
-from morph_dslam.tracking.state import BoundPoints
+from morph_dslam.tracking.state import BoundPoints, moved, pose_increment
 from morph_dslam.tracking.systematic_errors import Unexplained
 
 Array = NDArray[np.float64]
@@ -393,10 +392,13 @@ def new_filter(estimator: Fitter[Frame], options: TrackerOptions) -> SequenceFil
 
 
 def at_constant_velocity(before: State, last: State) -> State:
-    """The state that follows two others if the change goes on."""
-    change = last.camera_from_object @ before.camera_from_object.inverse
-    pose = change @ last.camera_from_object
-    return State(2.0 * last.parameters - before.parameters, RigidTransform(pose.rotation, pose.translation))
+    """The state that follows two others if the change goes on.
+
+    The turn goes on by its rotation vector: a product of rotation matrices would double in every frame by how much
+    rounding has made them none.
+    """
+    turned = pose_increment(before.camera_from_object, last.camera_from_object)
+    return moved(last, np.concatenate([last.parameters - before.parameters, turned]))
 
 
 def temporal_facts(parameters: Sequence[Parameter], options: TrackerOptions) -> dict[str, str]:

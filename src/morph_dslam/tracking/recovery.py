@@ -17,7 +17,7 @@ from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.reference import ReferenceView
-from morph_dslam.tracking.state import State
+from morph_dslam.tracking.state import Prior, State
 
 Array = NDArray[np.float64]
 #: An object that is found anew is believed if half of its points agree, or if they agree as closely as this,
@@ -99,7 +99,7 @@ class Recovery:
         return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
 
     def recover(
-        self, picture: Image, last_shape: Array, rejection: Rejection
+        self, picture: Image, last_shape: Array, rejection: Rejection, held: Prior | None = None
     ) -> tuple[PoseHypothesis | None, Rejection | None]:
         """The object somewhere in the frame, or None and why it is lost.
 
@@ -107,12 +107,13 @@ class Recovery:
         ----------
         last_shape : (d,), the parameters known last.
         rejection : why it was not found by its last state.
+        held : its pose, where this is one over the sequence; then the object can be nowhere else.
         """
-        found, matches = self._find(picture, self._shapes(last_shape), None)
+        found, matches = self._find(picture, self._shapes(last_shape), None, held)
         if matches is not None:
             return None, replace(rejection, then=Rejection(RejectionReason.FEW_FEATURES, matches))
-        if found is None:
-            return None, rejection
+        if found is None or held is not None:
+            return found, rejection if found is None else None
         other = self.another(picture, found)
         if other is not None:
             counts = int(found.inliers.sum()), int(other.inliers.sum())
@@ -144,24 +145,28 @@ class Recovery:
         return other if other is not None and self._apart(found, other) else None
 
     def _find(
-        self, picture: Image, shapes: list[Array], mask: NDArray[np.uint8] | None
+        self, picture: Image, shapes: list[Array], mask: NDArray[np.uint8] | None, held: Prior | None = None
     ) -> tuple[PoseHypothesis | None, int | None]:
         """A place where the object is to be believed, or None; and how many features agreed, if too few."""
         with stage("recover"):
             state, matches = self._reference.relocaliser.find(picture.grey, shapes, mask)
         if state is None:
             return None, matches
-        candidate = self._estimation.correct(picture, state, None, None)
-        candidate = self._estimation.correct(picture, candidate.estimate.state, None, None)
+        state = state if held is None else held.placed(state)
+        candidate = self._estimation.correct(picture, state, None, held)
+        candidate = self._estimation.correct(picture, candidate.estimate.state, None, held)
         if reject(candidate, self._options) is not None:
             return None, None
         with stage("search"):
             better = self._estimation.best_of(candidate, self._starts(candidate))
-        candidate = self._estimation.correct(picture, better.estimate.state, None, None)
+        candidate = self._estimation.correct(picture, better.estimate.state, None, held)
         return (candidate if self.reject(candidate, followed=False) is None else None), None
 
     def _starts(self, candidate: PoseHypothesis) -> list[State]:
-        """Shapes spread over the box, each in the poses in which it fits the supporting points best."""
+        """Shapes spread over the box, each in the held pose, or where it fits the supporting points best."""
+        if candidate.prior is not None:
+            place = candidate.prior.placed(candidate.estimate.state)
+            return [replace(place, parameters=shape) for shape in shape_starts(self._model, MOST_SHAPES)]
         points, rows = self._reference.points, candidate.inliers
         pixels = candidate.measurement.pixels[rows]
         starts = []

@@ -316,7 +316,7 @@ class Tracker:
             return hypothesis, FoundBy.LAST_STATE, rejection
         if self._placed_by_map(camera) is not None and self._n_lost % self.options.look_every:
             return hypothesis, FoundBy.FEATURES, rejection
-        found, why = self._view.recovery.recover(image, self._last.parameters, rejection)
+        found, why = self._view.recovery.recover(image, self._last.parameters, rejection, self._still)
         return hypothesis if found is None else found, FoundBy.FEATURES, why
 
     def _reconsider(self, image: Image, hypothesis: PoseHypothesis) -> tuple[PoseHypothesis, FoundBy]:
