@@ -29,8 +29,8 @@ TOLERANCE = 1e-10
 MOST_ITERATIONS = 50
 #: A longer readout time is a mistake of units, seconds.
 LONGEST_READOUT_S = 0.5
-#: The least focal length of a lens that is no fisheye, as a share of the image's side: a view of 157 degrees.
-LEAST_FOCAL_SHARE = 0.1
+#: The least focal length of a lens that is no fisheye, as a share of the image's side: a view of 136 degrees.
+LEAST_FOCAL_SHARE = 0.2
 #: Sides of images of two sizes have the same ratio up to this part.
 SAME_RATIO = 0.01
 #: Numbers of coefficients of each lens model.

@@ -67,9 +67,9 @@ def test_a_focal_length_in_millimetres_is_refused_before_anything_is_written(tmp
 
 
 def test_wide_lenses_and_fisheyes_may_be_meant():
-    with pytest.raises(CameraError, match="157 degrees"):
-        md.Camera(640, 480, 63.9, 63.9, 320.0, 240.0).check_focal_length("camera.yaml")
-    md.Camera(640, 480, 64.1, 64.1, 320.0, 240.0).check_focal_length("camera.yaml")
+    with pytest.raises(CameraError, match="136 degrees"):
+        md.Camera(640, 480, 127.9, 127.9, 320.0, 240.0).check_focal_length("camera.yaml")
+    md.Camera(640, 480, 128.1, 128.1, 320.0, 240.0).check_focal_length("camera.yaml")
     md.Camera(640, 480, 60.0, 60.0, 320.0, 240.0, (0.0,) * 4, "fisheye").check_focal_length("camera.yaml")
 
 

@@ -25,9 +25,9 @@ def attempt(share, sigma_px, prior=None, visible=1.0, alike=False) -> Any:
     )
 
 
-def new() -> Recovery:
+def new(options: TrackerOptions | None = None) -> Recovery:
     anything: Any = None
-    return Recovery(anything, anything, anything, anything, TrackerOptions())
+    return Recovery(anything, anything, anything, anything, options or TrackerOptions())
 
 
 @pytest.fixture
@@ -86,3 +86,13 @@ FOUND = [(0.4, True, True), (0.2, True, False), (0.4, False, False)]
 def test_a_followed_object_is_lost_where_very_few_points_agree_loosely(recovery, share, followed, believed):
     """Half of a sheet that is covered, with a model that is wrong by pixels, has more than that."""
     assert (recovery.reject(attempt(share, 3.5, alike=True), followed) is None) == believed
+
+
+@pytest.mark.parametrize(("share", "followed", "believed"), FOUND)
+def test_a_pose_that_is_held_says_nothing_of_a_frame(share, followed, believed):
+    """Where a specimen has torn, one of its halves agrees with the pose that both had."""
+    still = new(TrackerOptions(pose="still"))
+    still.learn(attempt(0.9, 0.3, prior=object()))
+    torn = attempt(share, 3.5, prior=object(), alike=True)
+    assert (still.reject(torn, followed) is None) == believed
+    assert still.doubt(attempt(0.4, 0.5, prior=object())) == pytest.approx(0.4)

@@ -70,7 +70,7 @@ class Recovery:
         """
         if np.isnan(self._usual_px):
             return 0.0
-        if attempt.prior is not None:  # the pose is known, so that fewer points tell as much
+        if self._known_by_map(attempt):  # fewer points tell as much
             if agree(attempt, self._options.least_share):
                 return 0.0
         elif agree(attempt, MOST_AGREE) and not self.partly_hidden(attempt):
@@ -83,7 +83,7 @@ class Recovery:
     def reject(self, attempt: PoseHypothesis, followed: bool) -> Rejection | None:
         """Why an object is not accepted; None when it is. One that was not ``followed`` must agree more closely."""
         rejection = reject(attempt, self._options)
-        if rejection is not None or attempt.outline_alone or attempt.prior is not None:
+        if rejection is not None or attempt.outline_alone or self._known_by_map(attempt):
             return rejection
         if agree(attempt, self._options.least_share if followed else MOST_AGREE):
             return None
@@ -93,6 +93,10 @@ class Recovery:
             return None
         visible, count = attempt.counts
         return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
+
+    def _known_by_map(self, attempt: PoseHypothesis) -> bool:
+        """Whether the frame's camera and the map say where it is; a pose that is held says nothing of a frame."""
+        return attempt.prior is not None and self._options.pose != "still"
 
     def partly_hidden(self, attempt: PoseHypothesis) -> bool:
         """Whether something else seems to be before the object."""
