@@ -13,6 +13,7 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.timing import stage
+from morph_dslam.tracking.compact_loads import LEAST_GAIN
 from morph_dslam.tracking.covariance import trace_of_share
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
@@ -37,6 +38,7 @@ from morph_dslam.tracking.state import BoundPoints, moved, pose_increment
 from morph_dslam.tracking.systematic_errors import Unexplained
 
 Array = NDArray[np.float64]
+_Measured = tuple[BoundPoints, Array, Array]
 #: How far an outline that is alone is searched for, pixels: the first after a loss only. That is for an object of this
 #: extent in the image, pixels; where it is larger, so are its motion and what the model leaves, up to this factor.
 REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
@@ -59,7 +61,7 @@ class ShapeSearch:
     a bound are for an estimate that ran into it because of an unobservable parameter. A lever that is turned
     to the left looks as if it were turned by less than nothing, as long as its side is taken to be the right
     one: the estimate ends at the bound, where its side has no effect and so cannot be corrected. From a start
-    that is turned a little, with another side, it can.
+    that is turned a little, with another side, it can. Shapes are those of the study: unknown loads start at zero.
 
     Parameters
     ----------
@@ -68,7 +70,7 @@ class ShapeSearch:
     """
 
     def __init__(self, model: ReducedModel, count: int) -> None:
-        shapes = np.array(shape_starts(model))
+        shapes = _study_shapes(model)
         order = np.random.default_rng(0).permutation(len(shapes) - 1) + 1
         self._model, self._shapes, self._count = model, shapes[np.concatenate([[0], order])], count
         self._next, self._random = 0, np.random.default_rng(0)
@@ -98,7 +100,16 @@ class ShapeSearch:
         width = model.upper - model.lower
         inside = np.clip(state.parameters, model.lower + OFF_BOUND * width, model.upper - OFF_BOUND * width)
         drawn = model.lower + self._random.random((self._count, len(width))) * width
+        drawn[:, d:] = model.default[d:]
         return [replace(state, parameters=np.where(free, row, inside)) for row in drawn]
+
+
+def _study_shapes(model: ReducedModel) -> Array:
+    """Parameters (k, d) to start from, spread over the box of the study's; unknown loads are zero."""
+    if model.energy is None:
+        return np.array(shape_starts(model))
+    own = np.array(shape_starts(model.energy.model))
+    return np.hstack([own, np.zeros((len(own), model.n_loads))])
 
 
 def with_unobservable_at_default(model: ReducedModel, estimate: Estimate) -> State:
@@ -137,6 +148,9 @@ class FrameEstimation:
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
         self._scout.loads = estimator.loads
+        energy = estimator.model.energy
+        has_both = energy is not None and len(energy.model.parameters) > 0
+        self._study_scout = Estimator(energy.model, estimator.camera, brief) if energy and has_both else None
         self._last_joined: tuple[BoundPoints, BoundPoints] | None = None
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
@@ -197,28 +211,83 @@ class FrameEstimation:
 
     def search_other_shapes(self, attempt: PoseHypothesis) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""
-        if attempt.outline_alone or not attempt.estimate.sigma_px < np.inf:
+        estimate = attempt.estimate
+        if attempt.outline_alone or not estimate.sigma_px < np.inf:
             return attempt
-        starts = self._search.starts(attempt.estimate, attempt.estimate.sigma_px > self._options.search_above_px)
+        anywhere = estimate.sigma_px > self._options.search_above_px or self._loads_hide_much(attempt)
+        starts = self._search.starts(estimate, anywhere)
+        if anywhere and self._study_scout is not None:
+            return self._with_other_loads(attempt, self._by_study_alone(self._study_scout, attempt, starts))
         return self.best_of(attempt, starts)
+
+    def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
+        """Whether unknown loads take up more of the image than is left: then they may do what a parameter should."""
+        estimate, rows = attempt.estimate, attempt.inliers
+        if self._study_scout is None:
+            return False
+        parameters = estimate.state.parameters.copy()
+        parameters[-self._estimator.model.n_loads :] = 0.0
+        unloaded = self._reference.points.in_camera(replace(estimate.state, parameters=parameters))
+        left = self._estimator.camera.project(unloaded)[rows] - attempt.measurement.pixels[rows]
+        return float(np.mean(left**2)) > 2.0 * float(np.mean(estimate.residuals[: len(rows)][rows] ** 2))
+
+    def _by_study_alone(self, scout: Estimator, attempt: PoseHypothesis, starts: list[State]) -> State:
+        """What explains the measurements best without unknown loads, reached from the attempt or one of the starts.
+
+        Where unknown loads have taken over from the study's own load, no small step leads back.
+        """
+        d, n_loads, prior = len(scout.model.parameters), self._estimator.model.n_loads, attempt.prior
+        few, _ = self._few_and_all(attempt)
+        points = BoundPoints.from_surface(scout.model, few[0].surface)
+        if prior is not None:
+            prior = replace(prior, mean=prior.mean[:d], information=prior.information[:d, :d])
+        own = [replace(start, parameters=start.parameters[:d]) for start in [attempt.estimate.state, *starts]]
+        best = min((scout.minimum(points, *few[1:], start, prior=prior) for start in own), key=lambda one: one.cost)
+        return replace(best.state, parameters=np.concatenate([best.state.parameters, np.zeros(n_loads)]))
+
+    def _with_other_loads(self, attempt: PoseHypothesis, start: State) -> PoseHypothesis:
+        """The attempt, or a clearly better explanation, loads' prior included, reached from a start.
+
+        All points count from the beginning: a few do not determine as many loads.
+        """
+        _, every = self._few_and_all(attempt)
+        state, prior, loads = attempt.estimate.state, attempt.prior, self._estimator.loads
+        enough = 0.0 if loads is None else LEAST_GAIN * loads.squared_px
+
+        def is_better(cost: float, than: float) -> bool:
+            return cost < max(CLEARLY_BETTER * than, than - enough)
+
+        other = self._scout.minimum(*every, start, prior=prior)
+        # The attempt is the best for the points that agree with it, and not quite for all.
+        if not is_better(other.cost, self._cost(every, state, prior)) or not is_better(
+            other.cost, self._scout.minimum(*every, state, prior=prior).cost
+        ):
+            return attempt
+        return self._trimmed(attempt.measurement, other.state, prior)
+
+    def _few_and_all(self, attempt: PoseHypothesis) -> tuple[_Measured, _Measured]:
+        """Some of the valid measurements, and all of them, with what they weigh together."""
+        measurement = attempt.measurement
+        weights, valid = self._noise.weights(measurement.spread, measurement.valid), np.flatnonzero(measurement.valid)
+        points, pixels = self._reference.points, measurement.pixels
+        rows = valid[:: 1 + len(valid) // SCOUTED]
+        # So many times the weight, lest a prior count for more among few.
+        few = (points.take(rows), pixels[rows], weights[rows] * (len(valid) / max(len(rows), 1)))
+        return few, (points, pixels, weights)
 
     def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
         if not starts:
             return attempt
-        measurement, prior, state = attempt.measurement, attempt.prior, attempt.estimate.state
-        weights, valid = self._noise.weights(measurement.spread, measurement.valid), np.flatnonzero(measurement.valid)
-        every = (self._reference.points, measurement.pixels, weights)
-        rows = valid[:: 1 + len(valid) // SCOUTED]
-        # So many times the weight, lest a prior count for more among few.
-        few = (every[0].take(rows), every[1][rows], weights[rows] * (len(valid) / max(len(rows), 1)))
+        prior, state = attempt.prior, attempt.estimate.state
+        few, every = self._few_and_all(attempt)
         best = min((self._scout.minimum(*few, start, prior=prior) for start in starts), key=lambda other: other.cost)
         for points in (few, every):
             if self._cost(points, best.state, prior) > CLEARLY_BETTER * self._cost(points, state, prior):
                 return attempt
-        return self._trimmed(measurement, best.state, prior)
+        return self._trimmed(attempt.measurement, best.state, prior)
 
-    def _cost(self, measured: tuple[BoundPoints, Array, Array], state: State, prior: Prior | None) -> float:
+    def _cost(self, measured: _Measured, state: State, prior: Prior | None) -> float:
         return self._estimator.evaluate(*measured, state, prior=prior)[0]
 
     def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
