@@ -224,7 +224,7 @@ def test_unknown_loads_that_do_not_act_leave_the_result_as_it_is(built, filmed, 
     with h5py.File(run / "result.h5") as file:
         acting, own = (file[f"reactions/{name}/force"][()] for name in ("unknown loads", "z_max"))
     assert np.linalg.norm(acting, axis=1).max() < 0.1 * np.linalg.norm(own, axis=1).max()
-    assert "force_unknown loads_x_N" in (run / "frames.csv").read_text().splitlines()[0]
+    assert "force_unknown_loads_x_N" in (run / "frames.csv").read_text().splitlines()[0]
     points = ["--points", str(built / "seq" / "truth.npz"), "--bind-frame", "0"]
     assert cli.main(["evaluate", str(run), *points]) == 0
     assert json.loads((run / "evaluation.json").read_text())["mean_mm"] < 0.5

@@ -22,6 +22,7 @@ class FakeCapture:
     """Delivers frame after frame, each when the test lets it; image k is filled with k."""
 
     def __init__(self):
+        self.opened = True
         self.asked, self.allowed = threading.Semaphore(0), threading.Semaphore(0)
         self.delivered = 0
         self.lost = False
@@ -37,6 +38,9 @@ class FakeCapture:
         self.image[:] = self.delivered
         self.delivered += 1
         return True, self.image
+
+    def isOpened(self):
+        return self.opened
 
     def get(self, propId):
         return 25.0
@@ -87,6 +91,50 @@ def test_a_camera_that_is_unplugged():
         with pytest.raises(SourceError, match="webcam 0 stopped delivering after frame 0"):
             next(frames)
     assert capture.released
+
+
+class Connection:
+    """Delivers some images, each filled with a number, and breaks off."""
+
+    def __init__(self, *levels):
+        self.levels, self.released = list(levels), False
+
+    def isOpened(self):
+        return bool(self.levels)
+
+    def read(self):
+        return (True, np.full((4, 6, 3), self.levels.pop(0), dtype=np.uint8)) if self.levels else (False, None)
+
+    def get(self, propId):
+        return 25.0
+
+    def release(self):
+        self.released = True
+
+
+def test_a_camera_on_the_network_is_connected_to_again_for_ten_seconds(monkeypatch, caplog):
+    """An attempt takes 3 s; the third one succeeds. After its frame none does, and 12 s are over with the fourth."""
+    monkeypatch.setattr("morph_dslam.sources.live.AGAIN_S", 0.0)
+    clock, made = FakeClock(), [Connection(1, 2)]
+
+    def reopen():
+        clock.now += 3.0
+        made.append(Connection(3) if len(made) == 3 else Connection())
+        return made[-1]
+
+    frames = []
+    with LiveCamera(made[0], "rtsp://camera/1", clock, "check the network", reopen) as camera:
+        with pytest.raises(SourceError, match="rtsp://camera/1 stopped delivering after frame 2: check the network"):
+            frames.extend(camera)
+        last = frames[-1]
+        assert (last.index, last.timestamp, last.captured) == (2, 9.0, 59.0)
+        assert int(last.image[0, 0, 0]) == 3
+    assert len(made) == 1 + 3 + 4
+    assert all(connection.released for connection in made)
+    assert [line for line in caplog.messages if "rtsp://camera/1" in line] == [
+        f"rtsp://camera/1 stopped delivering after frame {n}: connecting again, for 10 seconds at most ..."
+        for n in (1, 2)
+    ]
 
 
 def test_a_recording_gives_every_frame_to_a_slow_consumer(tmp_path):
@@ -319,9 +367,16 @@ def test_sockets_that_cannot_be_used(sender):
 
 
 class Served:
-    """A server on this computer that sends the same film to everyone who connects, and then falls silent."""
+    """A server on this computer that sends a film to everyone who connects, and then falls silent, or hangs up.
 
-    def __init__(self, parts):
+    Parameters
+    ----------
+    parts : of the film.
+    hangs_up : whether the first who connects is cut off behind it.
+    """
+
+    def __init__(self, parts, hangs_up=False):
+        self.hangs_up = hangs_up
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
         self.connections = []
@@ -339,6 +394,8 @@ class Served:
                 connection.recv(4096)
             for part in parts:
                 connection.sendall(part)
+            if self.hangs_up and len(self.connections) == 1:
+                connection.shutdown(socket.SHUT_RDWR)
 
     def close(self):
         self.listener.shutdown(socket.SHUT_RDWR)
@@ -346,6 +403,15 @@ class Served:
         self.listener.close()
         for connection in self.connections:
             connection.close()
+
+
+def motion_jpeg(levels):
+    """The parts of a film whose pictures are grey."""
+    parts = [b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=next\r\n\r\n"]
+    for level in levels:
+        jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), level, np.uint8))[1].tobytes()
+        parts.append(b"--next\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n" % (len(jpeg), jpeg))
+    return parts
 
 
 @pytest.fixture
@@ -356,12 +422,7 @@ def impatient(monkeypatch):
 @pytest.mark.usefixtures("impatient")
 def test_a_camera_on_the_network():
     """Pictures as motion JPEG over HTTP, as network cameras send them; then silence."""
-    head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=next\r\n\r\n"
-    parts = [head]
-    for level in range(0, 240, 2):
-        jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), level, np.uint8))[1].tobytes()
-        parts.append(b"--next\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n" % (len(jpeg), jpeg))
-    server = Served(parts)
+    server = Served(motion_jpeg(range(0, 240, 2)))
     try:
         with open_live(f"http://user:secret@{server.address}/video") as camera:
             assert camera.name == f"http://{server.address}/video"
@@ -372,6 +433,20 @@ def test_a_camera_on_the_network():
         server.close()
     assert levels
     assert levels == sorted(set(levels))
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_camera_on_the_network_that_hangs_up_is_connected_to_again(caplog):
+    server = Served(motion_jpeg(range(0, 240, 4)), hangs_up=True)
+    frames = []
+    try:
+        with open_live(f"http://{server.address}/video") as camera, pytest.raises(SourceError, match="stopped deliver"):
+            frames.extend(camera)
+    finally:
+        server.close()
+    assert len(server.connections) == 2
+    assert frames[-1].index >= 60  # of the second connection: the film has 60 pictures
+    assert "connecting again" in caplog.text
 
 
 @pytest.mark.usefixtures("impatient")

@@ -218,6 +218,22 @@ def test_nobody_waits_for_a_slow_client_who_misses_frames_and_gets_the_newest(pu
     assert numbers[-1] == n_sent - 1
 
 
+def test_few_messages_wait_for_a_client_that_reads_nothing(publisher, sink, model):
+    """Small ones would fit into the buffers of both systems by the hundred, and get old there."""
+    received, n_sent = taking(publisher), 100
+    with connect(stream_address(publisher), **PLAIN) as slow:
+        for number in range(n_sent):
+            sink(tracked_frame(number, 0.0, block=tracked_result(model, 0.1, 0.0)))
+            while next(received)["number"] < number:  # the server has had time for it
+                pass
+        late = [client.unpack(slow.recv(timeout=20.0))]
+        while late[-1].get("number") != n_sent - 1:
+            late.append(client.unpack(slow.recv(timeout=20.0)))
+    assert late[0]["type"] == "scene"
+    # One is being read, another waits in the library, another in the system; then comes the newest.
+    assert len(late) <= 1 + 3 + 1
+
+
 def test_a_client_that_takes_nothing_does_not_keep_the_stream_from_its_end(publisher):
     large = ObjectInfo("large", "large", np.zeros((200_000, 3)), np.zeros((1, 3), int), np.arange(1), (), None, ())
     narrow = socket.socket()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from errno import ENOSPC
@@ -161,6 +162,18 @@ def test_frame_logs(tmp_path: Path) -> None:
     log = FrameLog(Path("/dev/full"), run)
     with pytest.raises(TrackingError, match="cannot write /dev/full: No space left on device"):
         log(SimpleNamespace())  # what it writes is the run's last frame
+
+
+def test_what_a_run_that_was_killed_left_is_kept(tmp_path: Path) -> None:
+    """Its log may be all there is: the folder has no result, so that the next run is not refused for that."""
+    log, run = tmp_path / "frames.jsonl", tracked_run(tmp_path / "run")
+    log.write_text('{"frame": 3}\n')
+    with pytest.raises(TrackingError, match=r"frames\.jsonl holds an earlier run: .*move this one, .*--overwrite"):
+        FrameLog(log, run)
+    assert log.read_text() == '{"frame": 3}\n'
+    again = RunFolder(tmp_path / "run", "sheet", run.results, CAMERA, overwrite=True)
+    FrameLog(log, again)(SimpleNamespace())
+    assert [json.loads(line)["status"] for line in log.read_text().splitlines()] == ["tracked"]
 
 
 def test_evaluations(tmp_path: Path) -> None:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
+from morph_dslam.sources import frames as limits
 from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, open_capture
 
+_LOG = logging.getLogger("morph_dslam")
 Item = TypeVar("Item")
+#: Seconds between two attempts to connect again.
+AGAIN_S = 0.5
 _WEBCAM = re.compile(r"(?:webcam:|/dev/video)(\d+)")
 #: As a path, which has lost one of two slashes.
 _URL = re.compile(r"(rtsps?|https?|rtmp|udp|tcp):/+(\S+)")
@@ -62,6 +69,8 @@ class Newest(Generic[Item]):
 
 class Capture(Protocol):
     """What is needed of `cv2.VideoCapture`."""
+
+    def isOpened(self) -> bool: ...
 
     def read(self) -> tuple[bool, NDArray | None]: ...
 
@@ -133,6 +142,15 @@ class LiveCamera(LiveStream):
     """A camera. Frames are numbered as they come, so a dropped frame leaves a gap.
 
     Timestamps are seconds since the first frame.
+
+    Parameters
+    ----------
+    capture : that delivers the frames.
+    name : for messages.
+    clock : gives the time, seconds.
+    advice : what to do where it stops delivering.
+    reopen : connects again where it stops delivering, until the last frame is `NETWORK_TIMEOUT_MS` old; None for a
+        camera that has no connection.
     """
 
     def __init__(
@@ -141,25 +159,52 @@ class LiveCamera(LiveStream):
         name: str = "camera",
         clock: Callable[[], float] = time.monotonic,
         advice: str = "check its cable",
+        reopen: Callable[[], Capture] | None = None,
     ) -> None:
         super().__init__(name, frame_rate(capture))
-        self._capture, self._clock, self._advice = capture, clock, advice
+        self._capture, self._clock, self._advice, self._reopen = capture, clock, advice, reopen
         self.start()
 
     def read(self) -> Iterator[Frame]:
-        index, start = 0, 0.0
+        index, start, now = 0, 0.0, 0.0
         while not self.closing:
             delivered, image = self._capture.read()
-            now = self._clock()
             if not delivered or image is None:
+                after = f"after frame {index - 1}" if index else "before the first frame"
+                what = f"{self.name} stopped delivering {after}"
+                image = self._image_after_reconnection(now, what) if index else None
                 if self.closing:
                     return
-                after = f"after frame {index - 1}" if index else "before the first frame"
-                raise SourceError(f"{self.name} stopped delivering {after}: {self._advice}")
+                if image is None:
+                    raise SourceError(f"{what}: {self._advice}")
+            now = self._clock()
             start = now if index == 0 else start
             # Captures may hand out the same memory again.
             yield Frame(index, now - start, np.array(image, dtype=np.uint8), captured=now)
             index += 1
+
+    def _image_after_reconnection(self, last: float, what: str) -> NDArray | None:
+        """The first image of another connection; None where there is none in time.
+
+        Parameters
+        ----------
+        last : when the last frame came, seconds.
+        what : has happened, for the log.
+        """
+        patience = 1e-3 * limits.NETWORK_TIMEOUT_MS
+        is_told = False
+        while self._reopen is not None and not self.closing and self._clock() - last < patience:
+            if not is_told:
+                _LOG.warning("%s: connecting again, for %g seconds at most ...", what, patience)
+                is_told = True
+            self._capture.release()
+            self._capture = self._reopen()
+            if self._capture.isOpened():
+                delivered, image = self._capture.read()
+                if delivered and image is not None:
+                    return image
+            time.sleep(AGAIN_S)
+        return None
 
     def release(self) -> None:
         self._capture.release()
@@ -202,7 +247,10 @@ def _open_address(url: str) -> LiveCamera:
             f"no video comes from {name}: check the address, its user and password, and that the camera is on and in "
             "this network"
         )
-    return LiveCamera(capture, name, advice="check the network, and that the camera is on")
+    # A film on a server has a length, and would begin again.
+    ends = capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
+    reopen = None if ends else partial(open_capture, url, is_remote=True)
+    return LiveCamera(capture, name, advice="check the network, and that the camera is on", reopen=reopen)
 
 
 def _without_password(url: str) -> str:

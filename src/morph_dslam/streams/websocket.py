@@ -1,6 +1,8 @@
 """A stream by WebSocket, and a page that shows it, served at one port by a thread of its own.
 
 Each client is sent the scene, then always the newest frame: who is slow gets fewer, and nobody waits for anybody.
+A message is followed by a ping, whose answer says that the client's side has read so far: only then comes the next.
+Otherwise messages would get old in the buffers of both systems.
 """
 
 from __future__ import annotations
@@ -67,6 +69,7 @@ class _Newest:
     n_frames : number of frames so far.
     ended : whether no more will come.
     changed : set at the next change, when another takes its place.
+    no_more : set once it has ended.
     """
 
     scene: bytes | None = None
@@ -75,6 +78,7 @@ class _Newest:
     n_frames: int = 0
     ended: bool = False
     changed: asyncio.Event = field(default_factory=asyncio.Event)
+    no_more: asyncio.Event = field(default_factory=asyncio.Event)
     _packet: tuple[int, bytes] = (0, b"")
 
     def packet(self) -> bytes:
@@ -151,6 +155,7 @@ class WebSocketPublisher:
 
         def change(newest: _Newest) -> None:
             newest.ended = True
+            newest.no_more.set()
 
         self._change(change)
         self._thread.join(3.0 * LAST_SECONDS)
@@ -198,14 +203,15 @@ class WebSocketPublisher:
         """Send a client scene and frames until there are no more, or it goes."""
         self._clients.add(client)
         newest, n_scenes, n_frames = self._newest, 0, 0
+        ended = asyncio.ensure_future(newest.no_more.wait())
         try:
             while True:
                 if newest.n_scenes > n_scenes and newest.scene is not None:
                     n_scenes = newest.n_scenes
-                    await client.send(newest.scene)
+                    await _send_and_wait(client, newest.scene, ended)
                 elif newest.n_frames > n_frames and newest.frame is not None:
                     n_frames = newest.n_frames
-                    await client.send(newest.packet())
+                    await _send_and_wait(client, newest.packet(), ended)
                 elif newest.ended:
                     await client.send(end_packet())
                     return
@@ -214,6 +220,7 @@ class WebSocketPublisher:
         except ConnectionClosed:
             pass  # it has gone
         finally:
+            ended.cancel()
             self._clients.discard(client)
 
     def _answer(self, client: ServerConnection, request: Request) -> Response | None:
@@ -238,6 +245,13 @@ class WebSocketPublisher:
         answer = _response(HTTPStatus.OK, _page(name), _TYPES[name.rpartition(".")[2]])
         answer.headers["Content-Security-Policy"] = _policy(request.headers["Host"])
         return answer
+
+
+async def _send_and_wait(client: ServerConnection, packet: bytes, ended: asyncio.Future) -> None:
+    """Send a message, and wait until the client has read it, or the stream has ended."""
+    await client.send(packet)
+    read = await client.ping()
+    await asyncio.wait({asyncio.ensure_future(read), ended}, return_when=asyncio.FIRST_COMPLETED)
 
 
 def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:
@@ -275,6 +289,7 @@ def _listening(host: str, port: int) -> socket.socket:
             f"{host}:{port} cannot be taken for --stream ws ({error}); choose another port, --stream ws:PORT; "
             "ws:0 takes any free one"
         ) from error
-    # Connections inherit it.
+    # Connections inherit both; without the second a ping would wait until the message before is acknowledged.
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WAITING)
+    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listening

@@ -1,4 +1,4 @@
-"""Says that the inner loops are compiled, which takes a while the first time that they are used."""
+"""Inner loops are compiled, which takes a while the first time that they are used: says so, and does it beforehand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import logging
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
+from morph_dslam.render.overlay import draw_overlay
+from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.tracking import estimator
 
 _LOG = logging.getLogger("morph_dslam")
@@ -26,3 +30,12 @@ def _is_compiled() -> bool:
     # Numba names the index of a compiled function by its first line: one of an older version does not count.
     line = estimator.linearise.py_func.__code__.co_firstlineno
     return any(Path(stats.cache_path).glob(f"estimator.linearise-{line}.*.nbi"))
+
+
+def compile_drawing() -> None:
+    """Draw a triangle, so that the first live picture takes no longer than the others."""
+    image = np.zeros((240, 320, 3), dtype=np.uint8)
+    nodes = np.array([[10.0, 10.0, 1.0], [30.0, 10.0, 1.0], [10.0, 30.0, 1.0]])
+    triangles = np.array([[0, 2, 1]])
+    light = lambert(vertex_normals(nodes, triangles), np.array([0.0, 0.0, -1.0]), 0.5)
+    draw_overlay(image, nodes[:, :2], nodes[:, 2], triangles, np.zeros(3), (0.0, 1.0), label="x", brightness=light)

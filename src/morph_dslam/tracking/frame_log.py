@@ -64,16 +64,22 @@ class FrameLog:
     Parameters
     ----------
     path : file to write; what it held is gone: `check_frame_log` says whether it may be.
-    folder : whose last frame is written; in a session's sinks it comes first.
+    folder : whose last frame is written; in a session's sinks it comes first. Where it may not replace a run, the log
+        of an earlier one is not replaced either: of a run that was killed it may be all that is left.
 
     Raises
     ------
     TrackingError
-        If the file cannot be written.
+        If the file cannot be written, or has frames of an earlier run that are not to be replaced.
     """
 
     def __init__(self, path: Path, folder: RunFolder) -> None:
         self._path, self._folder = path, folder
+        if not folder.overwrite and path.is_file() and path.stat().st_size:
+            raise TrackingError(
+                f"the frame log {path} holds an earlier run: name another file, move this one, or allow both it and "
+                f"{folder.path} to be replaced (`--overwrite`)"
+            )
         self.start_again()
 
     def start_again(self) -> None:

@@ -32,6 +32,7 @@ from morph_dslam.notices import Notice
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
+from morph_dslam.tracking.repeated_pictures import RepeatedPictures
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_notices import flags_of, notices_of
 from morph_dslam.tracking.run_results import RunResults
@@ -54,6 +55,10 @@ class RunFolder:
     inner : structures inside of the object.
     overwrite : whether to replace a run that is in the folder.
 
+    Attributes
+    ----------
+    overwrite : as given.
+
     Raises
     ------
     MorphError
@@ -70,11 +75,13 @@ class RunFolder:
         overwrite: bool = False,
     ) -> None:
         make_run_folder(path, overwrite)
-        self.path, self.name, self.results = path, name, results
-        self._camera, self._inner = camera, inner
+        self.path, self.name, self.results, self.overwrite = path, name, results, overwrite
+        self._camera, self._inner, self._repeated = camera, inner, RepeatedPictures()
 
     def __call__(self, tracked: TrackedFrame) -> None:
         """Take in a frame."""
+        if tracked.frame.captured is not None:
+            self._repeated.add(tracked.frame)
         self.results.add(tracked.frame.index, tracked.frame.timestamp, tracked.results[self.name])
 
     def start_again(self, results: RunResults, camera: Camera) -> None:
@@ -98,7 +105,7 @@ class RunFolder:
             return self._write(facts or {}, notices)
 
     def _write(self, facts: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
-        run, path = self.results, self.path
+        run, path, notices = self.results, self.path, [*notices, *self._repeated.notices()]
         write_hdf5(path / "result.h5", run)
         write_inner_positions(path / "result.h5", run, self._inner)
         write_csv(path / "frames.csv", run)
@@ -205,7 +212,8 @@ def _reaction_columns(run: RunResults) -> tuple[list[str], list[list[str]]]:
     rows: list[list[str]] = [[] for _ in run.frames]
     for support, frames in run.reactions().items():
         for kind, unit in (("force", "N"), ("moment", "Nmm")):
-            names += [f"{kind}_{support}_{axis}{std}_{unit}" for std in ("", "_std") for axis in "xyz"]
+            title = support.replace(" ", "_")
+            names += [f"{kind}_{title}_{axis}{std}_{unit}" for std in ("", "_std") for axis in "xyz"]
         for row, reaction in zip(rows, frames, strict=True):
             values = np.full(12, np.nan) if reaction is None else np.concatenate(_parts_of(reaction))
             row += ["" if np.isnan(v) else f"{v:.5g}" for v in values * np.repeat([1.0, 1e3], 6)]

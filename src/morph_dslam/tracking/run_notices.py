@@ -71,6 +71,11 @@ class RunWarning(StrEnum):
     UNOBSERVABLE = "{statement}"
     REREGISTERED = "registered anew in frame {frame}"
     NOT_REREGISTERED = "not registered anew in frame {frame}: {why}"
+    SAME_PICTURE = (
+        "the camera delivered exactly the same picture again in {count} frames, first in frame {first}, for up to "
+        "{longest_s:.1f} s: it, or what sends its pictures, may have been frozen; results there say nothing of the "
+        "object"
+    )
     UNEQUAL_RECORDINGS = (
         "the cameras recorded {counts} frames: {tracked} were tracked, to the end of the shortest recording"
     )

@@ -21,7 +21,9 @@ from morph_dslam.io.local_server import LocalHandler, local_server
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame
 from morph_dslam.sources.local_socket import SocketCamera
+from morph_dslam.tracking.compilation import compile_drawing
 from morph_dslam.tracking.drawing import AugmentedView, with_caption
+from morph_dslam.tracking.repeated_pictures import RepeatedPictures
 from morph_dslam.tracking.result import FrameResult
 
 
@@ -54,7 +56,7 @@ Sink = Callable[[TrackedFrame], object]
 
 @dataclass
 class LiveTimes:
-    """A sink: when frames were captured and how long it took until they were drawn.
+    """A sink: when frames were captured and how long it took until they were drawn; tells of a frozen camera.
 
     Attributes
     ----------
@@ -66,8 +68,10 @@ class LiveTimes:
     frames: list[int] = field(default_factory=list)
     captured: list[float] = field(default_factory=list)
     latency: list[float] = field(default_factory=list)
+    _repeated: RepeatedPictures = field(default_factory=partial(RepeatedPictures, tells=True), repr=False)
 
     def __call__(self, tracked: TrackedFrame) -> None:
+        self._repeated.add(tracked.frame)
         self.frames.append(tracked.frame.index)
         self.captured.append(tracked.frame.captured or 0.0)
         self.latency.append(tracked.latency_s)
@@ -106,6 +110,7 @@ class LivePicture:
     """
 
     def __init__(self, camera: Camera, views: Mapping[str, AugmentedView]) -> None:
+        compile_drawing()
         ranges = np.array([view.range_of_box() for view in views.values()])
         self._views, self._limits = dict(views), (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
         self._maps = camera.undistortion_maps()
