@@ -346,3 +346,20 @@ def test_mistakes_are_one_message(file, tmp_path, capsys):
         with_unknown_loads(bare)
     assert cli.main(["info", str(file)]) == 0
     assert re.search(r"unknown loads", capsys.readouterr().out)
+
+
+def test_places_that_are_held_have_no_loads():
+    """A pressure there would move nothing: of unit compliance, its force would be beyond all others."""
+    skin = {"skin": {"box": [["-1 mm"] * 3, ["61 mm"] * 3]}}
+    content = STUDY | {
+        "mesh": STUDY["mesh"] | {"divisions": [6, 6, 2]},
+        "sets": skin,
+        "sampling": {"scheme": "even", "training": 8, "held_out": 4, "refined": 0},
+        "unknown_loads": {"on": "skin", "modes": 60},
+    }
+    model = build(make_study(content))
+    loads = model.unknown_loads
+    forces = np.linalg.norm(loads.resultants[:, :3], axis=1)
+    assert forces.max() < 10.0 * np.median(forces)
+    # The base is 36 of 120 square centimetres, and those at its rim reach what moves.
+    assert 60 * (1.0 - 36.0 / 120.0) <= loads.count < 60

@@ -51,7 +51,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration-aids", "csv"): 1,
         ("shell-study", "toml"): 2,
         ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 7,
+        ("solid-study", "toml"): 8,
         ("study-file", "toml"): 1,
     }
 
@@ -186,6 +186,24 @@ def test_values_of_a_solids_study():
     assert found["x"][0].slopes == pytest.approx((0.0, 0.0, 0.0, 0.0015))
 
 
+def test_sets_by_their_place():
+    """Of a block from the origin: the lowest row of cells, and a spot of its top."""
+    sizes = {"size": ["60 mm", "40 mm", "31 mm"], "divisions": [30, 20, 6]}
+    study = {
+        "name": "block",
+        "mesh": {"generator": "block", "cells": "hex8", **sizes},
+        "materials": {"silicone": {"law": "neo_hookean", "young": "0.1 MPa", "poisson": 0.45}},
+        "supports": [{"kind": "fixed", "on": "base"}],
+        "loads": [{"kind": "pressure", "on": "pressed", "pressure": "p"}],
+        "parameters": {"p": {"range": ["0 kPa", "1 kPa"]}},
+    }
+    mesh = make_study(study | tomllib.loads(samples("solid-study", "toml")[1])).solid_mesh()
+    assert mesh.nodes[mesh.set_nodes("base"), 2].max() == pytest.approx(0.031 / 6)
+    spot = mesh.nodes[mesh.surface_nodes("pressed")]
+    np.testing.assert_allclose(spot[:, 2], 0.031)
+    assert np.linalg.norm(spot - [0.012, 0.004, 0.031], axis=1).max() <= 0.009
+
+
 def test_a_strip_that_buckles_upwards_first():
     study = {
         "name": "strip",
@@ -193,7 +211,7 @@ def test_a_strip_that_buckles_upwards_first():
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
         "parameters": {"weight": {"range": ["0 Pa", "30 Pa"], "default": "20 Pa"}},
     }
-    sample = tomllib.loads(samples("solid-study", "toml")[1])
+    sample = tomllib.loads(samples("solid-study", "toml")[2])
     weight = {"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-1 * weight"]}
     supports, loads = [{"kind": "fixed", "on": "x_min"}, *sample["supports"]], [*sample["loads"], weight]
     sweep = make_study(study | {"supports": supports, "loads": loads}).sweep_problem()
@@ -209,7 +227,7 @@ def test_a_bar_with_a_fitting_at_its_end():
         "supports": [{"kind": "fixed", "on": "x_min"}],
         "parameters": {"pull": {"range": ["0 N", "0.1 N"]}, "bend": {"range": ["-5 N.mm", "5 N.mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[2])
+    study |= tomllib.loads(samples("solid-study", "toml")[3])
     sweep = make_study(study).sweep_problem()
     outputs = sweep.take_snapshot(sweep.advance(sweep.first_state(), np.array([0.05, 2e-3]))).outputs
     place = np.array([0.12, 0.0, 0.025]) + outputs["translation_x_max"]
@@ -227,7 +245,7 @@ def test_a_ball_that_presses_on_a_block():
         "supports": [{"kind": "fixed", "on": "z_min"}],
         "parameters": {"depth": {"range": ["0 mm", "8 mm"]}} | places,
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[3])
+    study |= tomllib.loads(samples("solid-study", "toml")[4])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert resolve_defaults(made).reduction.method == "pod"
@@ -254,7 +272,7 @@ def test_shape_of_a_solid():
         "supports": [{"kind": "fixed", "on": "bottom"}],
         "parameters": {"growth": {"range": ["-0.5 mm", "1 mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[4])
+    study |= tomllib.loads(samples("solid-study", "toml")[5])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert [shape.kind for shape in made.shape] == ["thickness"]
@@ -263,7 +281,7 @@ def test_shape_of_a_solid():
 
 
 def test_solutions_of_another_program(tmp_path):
-    study = make_study(tomllib.loads(samples("solid-study", "toml")[6]), tmp_path)
+    study = make_study(tomllib.loads(samples("solid-study", "toml")[7]), tmp_path)
     assert isinstance(study, ExternalStudy)
     (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
     parameters, values, rows = read_table(study.external.table)
@@ -354,5 +372,5 @@ def test_evaluation_in_memory(tmp_path, monkeypatch):
 
 
 def test_unknown_loads():
-    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[5])["unknown_loads"])
+    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[6])["unknown_loads"])
     assert (section.on, section.direction, section.modes) == ("top", "inward", 60)

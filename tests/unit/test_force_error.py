@@ -80,6 +80,23 @@ def test_a_curve_by_a_parameter_is_read_between_its_points():
     np.testing.assert_allclose(measured, 100.0 * ARCHES[:6])
 
 
+def test_frames_between_two_rows_of_a_curve_tell_nothing_of_it():
+    """A curve in millimetres whose column says metres."""
+    curve = ForceCurve("arch", np.array([0.0, 10.0, 20.0, 30.0]), np.array([0.0, 1.0, 2.0, 3.0]))
+    with pytest.raises(
+        EvaluationError, match=r"all 10 frames .* between two neighbouring rows .* arch \[mm\] 0 to 30000"
+    ):
+        evaluate_force(pulled_run(), curve)
+
+
+def test_frames_on_a_small_part_of_a_curve_are_noted():
+    """45 mm of 4.5 m are 1 % of it."""
+    places = np.linspace(0.0, 4.5, 1001)
+    figures = evaluate_force(pulled_run(), ForceCurve("arch", places, places))
+    assert figures["share_of_curve"] == pytest.approx(0.01)
+    assert "the frames compared cover 1 % of the curve's range of arch" in "\n".join(force_remarks(figures))
+
+
 @pytest.mark.parametrize(
     ("asked", "factor", "direction"),
     [

@@ -163,6 +163,22 @@ def test_forces_by_frame_name_the_loading_rate() -> None:
     assert "loading rate: a_1 0.02 a frame" in "\n".join(identification_lines(figures))
 
 
+def test_what_is_identified_is_no_loading_rate() -> None:
+    """All parameters rise in the run, and c, of which the force depends by b, is identified."""
+    model, frames = plate(), np.arange(10, 40)
+    edge = model.reactions["force_edge"]
+    edge.modes[2, 0, 2] = 10.0
+    rise = np.arange(30)[:, None] * [0.02, 0.01, 0.005] + [0.1, 0.2, 0.5]
+    words, poses = ("tracked",) * 30, np.tile(np.eye(4), (30, 1, 1))
+    run = Run(model, Camera(640, 480, 500.0, 500.0, 319.5, 239.5), frames, words, words, poses, rise, {})
+    # With c = 0.8, whose scaled value is 0.6.
+    curve = ForceCurve("frame", frames.astype(float), 100.0 * rise[:, 0] + 6.0 * (2.0 * rise[:, 1] - 1.0))
+    found = identify(model, [MeasuredForces(model, curve, reaction_in_direction(model, "edge:z"), run)], ["c"])
+    assert found.estimates[0].value == pytest.approx(0.8, abs=1e-4)
+    (figures,) = summarise(found)["measurements"]
+    assert figures["loading_rate_per_frame"] == pytest.approx({"a_1": 0.02, "b_1": 0.01})
+
+
 def test_points_and_forces_are_weighted_by_what_they_are_missed_by() -> None:
     """The shift is 0.3 by points good to 1 mm, and 0.35 by forces with an error of 20 N: the points decide."""
     table = points_at([0.3] * 6, 1e-3)

@@ -146,7 +146,7 @@ def test_the_physical_groups_of_gmsh_become_sets_by_their_dimension(tmp_path):
     check_mesh(mesh)
     assert cell_volumes(mesh) == pytest.approx([1e-6, 1e-6], rel=1e-12)
     assert {name: cells.tolist() for name, cells in mesh.cell_sets.items()} == {"soft": [0], "hard": [1]}
-    assert list(mesh.surfaces) == ["grip"]
+    assert mesh.surfaces.keys() - mesh.found == {"grip"}
     assert surface_area(mesh, "grip") == pytest.approx(1e-4, rel=1e-12)
     np.testing.assert_allclose(mesh.nodes[mesh.surface_nodes("grip"), 0], 0.02)
     np.testing.assert_allclose(mesh.nodes[mesh.set_nodes("edge")], [[0, 0, 0], [0.01, 0, 0]])
@@ -232,7 +232,8 @@ def test_info_prints_the_sets_of_a_mesh(tmp_path, capsys):
     assert cli.main(["info", str(tmp_path / "block.inp"), "--unit", "cm"]) == 0
     title, _, *rows = capsys.readouterr().out.splitlines()
     assert title.endswith("20 x 30 x 60 mm, 2 hex8, 12 nodes")
-    assert [" ".join(row.split()) for row in rows] == [
+    named = [" ".join(row.split()) for row in rows if row.split()[0][1:] not in ("_min", "_max")]
+    assert named == [
         "face_2 faces 2 1800 0 15 30 -1.00 0.00 0.00",
         "face_10 faces 1 600 10 15 60 0.00 0.00 1.00",
         "skin faces 10 7200 10 15 30 none",
@@ -320,24 +321,102 @@ def test_a_cube_of_twelve_triangles_is_meshed_anew_where_a_cell_size_is_given(tm
     assert [surface_area(mesh, f"face_{i + 1}") for i in range(6)] == pytest.approx([1e-4] * 6, rel=1e-6)
 
 
+def write_obj(path, points, faces):
+    text = "".join("v {} {} {}\n".format(*point) for point in points)
+    path.write_text(text + "".join("f {} {} {}\n".format(*(face + 1)) for face in faces))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda faces: faces[:-1], "not watertight: 3 edges have a triangle on one side only"),
-        (lambda faces: np.vstack([faces, faces[:1]]), "bounds no volume: 3 edges have more than two triangles"),
-        (lambda faces: np.vstack([faces[:-1], faces[-1:, ::-1]]), "do not all turn the same way"),
-        (lambda faces: faces[:, ::-1], "face inwards; flip its normals"),
+        (lambda faces: faces[:24], "not watertight: 8 edges have a triangle on one side only"),
         (lambda faces: faces[:0], "holds no faces"),
         (lambda faces: faces + 1, "refer to points which it does not hold"),
     ],
 )
 def test_surfaces_that_bound_no_volume_are_refused(tmp_path, change, message):
     points, faces = icosphere(1)
+    # By the octant that a face lies in: without the last two the hole is a quarter of the surface.
+    octants = (points[faces].mean(axis=1) > 0) @ [1, 2, 4]
     path = tmp_path / "sphere.obj"
-    text = "".join("v {} {} {}\n".format(*point) for point in points)
-    path.write_text(text + "".join("f {} {} {}\n".format(*(face + 1)) for face in change(faces)))
+    write_obj(path, points, change(faces[np.argsort(octants, kind="stable")]))
     with pytest.raises(StudyError, match=message):
         load_mesh(path, "mm")
+
+
+def test_cubes_that_share_an_edge_bound_no_volume(tmp_path):
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    squares = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    cube = np.concatenate([squares[:, [0, 1, 2]], squares[:, [0, 2, 3]]])
+    points = np.concatenate([corners, corners + np.array([1, 1, 0])])
+    write_obj(tmp_path / "cubes.obj", points, np.concatenate([cube, cube + 8]))
+    with pytest.raises(StudyError, match="bounds no volume: 1 edges have more than two triangles"):
+        load_mesh(tmp_path / "cubes.obj", "mm")
+
+
+@pytest.mark.parametrize(
+    ("change", "repair"),
+    [
+        (lambda faces: faces[1:], "1 holes closed"),
+        (lambda faces: np.vstack([faces, faces[:1]]), "1 double faces removed"),
+        (lambda faces: np.vstack([faces[:1, ::-1], faces[1:]]), "1 faces turned"),
+        (lambda faces: faces[:, ::-1], "1 parts turned inside out"),
+    ],
+)
+def test_flawed_surfaces_are_filled_to_the_volume_of_sound_ones_and_info_says_so(tmp_path, capsys, change, repair):
+    points, faces = icosphere(2)
+    path = tmp_path / "sphere.obj"
+    write_obj(path, 20.0 * points, change(faces))
+    mesh = load_mesh(path, "mm")
+    check_mesh(mesh)
+    assert cell_volumes(mesh).sum() == pytest.approx(0.02**3 * polyhedron_volume(points, faces), rel=1e-9)
+    assert cli.main(["info", str(path)]) == 0
+    assert f"note: the surface of sphere.obj was repaired: {repair}\n" in capsys.readouterr().out
+
+
+def test_info_says_how_far_a_coarse_mesh_is_from_its_surface(tmp_path, capsys):
+    """A tetrahedral ball of few cells lies inside the sphere, its volume as its triangles have it."""
+    points, faces = icosphere(4)
+    path = tmp_path / "ball.obj"
+    write_obj(path, 20.0 * points, faces)
+    assert cli.main(["info", str(path)]) == 0
+    assert "note" not in capsys.readouterr().out, "the file's own triangles are kept"
+    assert cli.main(["info", str(path), "--size", "12"]) == 0
+    smaller, away = re.search(
+        r"note: the mesh is (\S+) % smaller .* up to (\S+) mm away", capsys.readouterr().out
+    ).groups()
+    mesh = load_mesh(path, "mm", 0.012)
+    volume, whole = cell_volumes(mesh).sum(), 0.02**3 * polyhedron_volume(points, faces)
+    assert float(smaller) == pytest.approx(100.0 * (1.0 - volume / whole), rel=0.06)
+    # The deepest point of a triangle inscribed in a sphere is the foot of the centre, if that is within.
+    a, b, c = np.moveaxis(mesh.nodes[mesh.surface_triangles()], 1, 0)
+    normals = np.cross(b - a, c - a)
+    depth = 0.02 - np.abs(np.einsum("ti,ti->t", a, normals)) / np.linalg.norm(normals, axis=1)
+    assert float(away) == pytest.approx(1e3 * depth.max(), rel=0.1)
+
+
+def test_a_surface_of_a_few_tenths_of_a_millimetre_may_have_another_unit(tmp_path, capsys):
+    points, faces = icosphere(1)
+    write_obj(tmp_path / "ball.obj", 0.06 * points, faces)
+    assert cli.main(["info", str(tmp_path / "ball.obj")]) == 0
+    assert "measures 0.12 x 0.12 x 0.12 mm; if that is not so, 'mm' is not the unit" in capsys.readouterr().out
+    assert cli.main(["info", str(tmp_path / "ball.obj"), "--unit", "m"]) == 0
+    assert "note" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["inp", "vtu"])
+def test_files_without_surfaces_get_their_flat_ends(tmp_path, kind):
+    drawn = replace(block((0.02, 0.03, 0.06), (2, 2, 3), "hex8"), surfaces={}, node_sets={})
+    path = tmp_path / f"block.{kind}"
+    if kind == "inp":
+        save_mesh(path, replace(drawn, node_sets={"z_min": np.array([0, 1])}), "mm")
+    else:
+        meshio.Mesh(1e3 * drawn.nodes, [("hexahedron", drawn.blocks[0].connectivity)]).write(path)
+    mesh = load_mesh(path, "mm")
+    areas = {"x_min": 18e-4, "x_max": 18e-4, "y_min": 12e-4, "y_max": 12e-4, "z_max": 6e-4}
+    areas |= {} if kind == "inp" else {"z_min": 6e-4}
+    assert mesh.surfaces.keys() == areas.keys(), "a name that the file has stays what it is"
+    assert {name: surface_area(mesh, name) for name in areas} == pytest.approx(areas)
 
 
 def test_a_damaged_surface_file_is_refused(tmp_path):

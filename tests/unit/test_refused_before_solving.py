@@ -141,6 +141,10 @@ def prepared(study: Study) -> None:
         ),
         (SOLID | {"loads": [*SOLID["loads"], LINE | {"width": "1 mm"}]}, "load 2: width = 1 mm is less than half"),
         (
+            SOLID | {"loads": [PATCH | {"width": "5 mm", "centre": ["p", "10 mm", "20 m"]}]},
+            r"load 1: its centre stays 1.998e\+04 mm or more away from 'z_max', and the mesh is 34.64 mm long: check",
+        ),
+        (
             SHELL | {"loads": [PATCH | {"on": "all", "width": "5 mm"}]},
             "load 1: width = 5 mm is less than half a cell of 'all', the smallest of which measures 15.81 mm",
         ),
@@ -304,6 +308,42 @@ def test_force_that_lands_is_not_warned_of():
     for load in (PATCH, LINE):
         (said,) = study_warnings(make_study(SOLID | {"loads": [load | {"width": "3 mm"}], "parameters": off}))
         assert said.startswith("load 1: nothing of the force lands on 'z_max' where p = 200 mm")
+
+
+TUBE = {
+    "generator": "tube",
+    "inner_radius": "5 mm",
+    "outer_radius": "10 mm",
+    "length": "60 mm",
+    "divisions": [24, 1, 36],
+}
+
+
+@pytest.mark.parametrize(
+    ("y", "z", "said"),
+    [
+        (7, 30, ", for its centre lies 3 mm off the surface: put it on it, at "),
+        (10, 2, ", and the rest falls beside it: keep the centre about two widths away from the rim"),
+        (7, 2, ", and the rest falls beside it: keep the centre about two widths away from the rim"),
+    ],
+)
+def test_a_centre_off_a_curved_surface_is_told_from_one_at_its_rim(y, z, said):
+    """A tube of 10 mm about the z axis, 60 mm long: its rims are its ends."""
+    patch = PATCH | {"on": "outer", "centre": ["p", f"{y} mm", f"{z} mm"], "width": "2 mm"}
+    content = SOLID | {"mesh": TUBE, "supports": [{"kind": "fixed", "on": "bottom"}], "loads": [patch]}
+    content |= {"parameters": {"p": {"range": ["-1 um", "1 um"]}}}
+    (warning,) = study_warnings(make_study(content))
+    assert said in warning
+
+
+def test_at_the_corner_of_a_closed_surface_a_quarter_of_a_patch_is_missing():
+    """Three quarters of planes meet there."""
+    skin = {"skin": {"box": [["-1 mm"] * 3, ["21 mm"] * 3]}}
+    patch = PATCH | {"on": "skin", "centre": ["20 mm + p", "20 mm", "20 mm"], "width": "2.5 mm"}
+    content = SOLID | {"sets": skin, "loads": [patch], "parameters": {"p": {"range": ["-1 um", "1 um"]}}}
+    (warning,) = study_warnings(make_study(content))
+    assert "only 75 % of the force lands on 'skin'" in warning
+    assert warning.endswith("which bends away from the patch, as at a corner: move its centre, or take a smaller width")
 
 
 def test_a_slanting_line_ends_at_the_rim_without_loss():

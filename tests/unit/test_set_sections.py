@@ -1,5 +1,7 @@
 """Sets that a study makes by their place: areas, volumes and numbers in closed form, and what cannot be."""
 
+from dataclasses import replace
+
 import meshio
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import trimesh
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.mesh_summary import faces_figures
+from morph_dslam.studies.solid_sections import mesh_fingerprint
 from morph_dslam.studies.study import make_study
 
 #: A block of 40 x 20 x 10 mm in cells of 5 mm, held and loaded by sets of its own.
@@ -154,7 +157,21 @@ def test_closed_cavities_are_surfaces(tmp_path):
 def test_a_body_without_cavities_has_none(tmp_path):
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [5, 0, 0], [6, 0, 0], [5, 1, 0], [5, 0, 1.0]])
     meshio.Mesh(points, [("tetra", np.arange(8).reshape(2, 4))]).write(tmp_path / "two.vtu")
-    assert not load_mesh(tmp_path / "two.vtu", "mm").surfaces
+    assert not [name for name in load_mesh(tmp_path / "two.vtu", "mm").surfaces if name.startswith("cavity")]
+
+
+def test_surfaces_that_a_file_does_not_name_neither_change_its_solutions_nor_take_names(tmp_path):
+    """A study's own set of the name of an end takes its place; one that uses the end is no other mesh."""
+    block = make_study(BLOCK).solid_mesh()
+    content = BLOCK | {"mesh": {"file": str(tmp_path / "block.vtu"), "unit": "m"}}
+    meshio.Mesh(block.nodes, [("hexahedron20", block.blocks[0].connectivity)]).write(tmp_path / "block.vtu")
+    study = make_study(content)
+    assert area(study.solid_mesh(), "z_max") == pytest.approx(8e-4)
+    kept = mesh_fingerprint(study.solid_mesh())
+    assert kept == mesh_fingerprint(replace(study.solid_mesh(), surfaces={}, found=frozenset()))
+    own = make_study(content | {"sets": {"z_max": {"box": [mm(-1, -1, 9), mm(20, 21, 11)]}}})
+    assert area(own.solid_mesh(), "z_max") == pytest.approx(4e-4)
+    assert mesh_fingerprint(own.solid_mesh()) != kept
 
 
 def test_a_shell_has_cells_for_faces():

@@ -48,10 +48,13 @@ def _print_model(arguments: argparse.Namespace) -> None:
 def _print_mesh(arguments: argparse.Namespace) -> None:
     from morph_dslam.extend.mechanics import SET_COLUMNS, described_mesh, set_rows
     from morph_dslam.extend.reports import Table
-    from morph_dslam.extend.studies import mesh_of_file
+    from morph_dslam.extend.studies import mesh_notes, mesh_of_file
 
-    mesh = mesh_of_file(arguments.model, arguments.unit or "mm", arguments.size)
+    described = arguments.model, arguments.unit or "mm", arguments.size
+    mesh = mesh_of_file(*described)
     print(f"{arguments.model}: {described_mesh(mesh)}")
     rows = set_rows(mesh)
     for line in Table(rows, SET_COLUMNS).text() if rows else ["no named sets"]:
         print(f"  {line}")
+    for note in mesh_notes(*described, mesh):
+        print(f"note: {note}")

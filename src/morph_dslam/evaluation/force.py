@@ -27,6 +27,8 @@ ROUNDING = 1e-9
 #: A component below this share of a support's largest force is rounding, as where models are built; in so many states
 #: beside the default.
 NEGLIGIBLE, SAMPLES = 1e-6, 32
+#: Frames that cover less than this share of a curve are worth a note: the unit of its places may be wrong.
+SMALL_SHARE = 0.02
 _REACTION = re.compile(r"(?P<support>.+?)(?::(?P<sign>[+-]?)(?P<axis>[xyz]))?")
 
 
@@ -172,6 +174,7 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
             f"only {int(kept.sum())} tracked frames lie on the curve, and at least {LEAST} are needed: it covers "
             f"{_range(run, curve.against, curve.places)}, the run {_range(run, curve.against, places)}"
         )
+    _check_spanned(run, curve, places[kept])
     rows, left_out = rows[kept], run.frames[rows[~kept]]
     compared, modelled, size = _modelled(run, rows, measured[kept], reaction)
     factor, offset, deviation = _fit(modelled, measured[kept], size)
@@ -217,6 +220,22 @@ def _on_curve(run: Run, curve: ForceCurve, rows: NDArray[np.integer]) -> tuple[A
         places = run.parameters[rows, index]
         found = (places >= known[0]) & (places <= known[-1])
     return places, np.where(found, np.interp(places, known, forces), np.nan)
+
+
+def _check_spanned(run: Run, curve: ForceCurve, places: Array) -> None:
+    """Raise EvaluationError if all places (e,) compared are between two neighbouring rows of the curve."""
+    if curve.against == "frame":
+        return
+    known = np.sort(curve.places)
+    first = np.searchsorted(known, places.min(), side="right") - 1
+    last = np.searchsorted(known, places.max(), side="left")
+    if last - first + 1 < LEAST:
+        raise EvaluationError(
+            f"all {len(places)} frames that lie on the curve are between two neighbouring rows of it, so that nothing "
+            f"of its course is compared: it covers {_range(run, curve.against, known)}, the run "
+            f"{_range(run, curve.against, places)}. Is the unit in the name of its first column right? Else give more "
+            "rows there"
+        )
 
 
 def _range(run: Run, against: str, places: Array) -> str:
@@ -324,6 +343,7 @@ def summarise_force(error: ForceError) -> dict[str, Any]:
         "direction": error.direction,
         "column": error.curve.name,
         "against": error.curve.against,
+        "share_of_curve": _share_of_curve(error),
         "factor": error.factor,
         "factor_std": error.factor_std,
         "offset_N": error.offset,
@@ -349,6 +369,13 @@ def summarise_force(error: ForceError) -> dict[str, Any]:
     }
 
 
+def _share_of_curve(error: ForceError) -> float | None:
+    """The part of the curve's range that the frames compared cover; None where the curve is given by frame."""
+    if error.curve.against == "frame":
+        return None
+    return float(np.ptp(error.places) / np.ptp(error.curve.places))
+
+
 def force_remarks(figures: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures must know: which reaction it is, and frames that were not compared."""
     lines = [reaction_remark(figures)]
@@ -356,6 +383,12 @@ def force_remarks(figures: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"the model's force changes by {figures['change_of_model_N']:.3g} N in the frames compared, and may be off "
             f"by {figures['own_error_of_model_N']:.3g} N by the model's own error: the factor says little"
+        )
+    share = figures["share_of_curve"]
+    if share is not None and share < SMALL_SHARE:
+        lines.append(
+            f"the frames compared cover {100.0 * share:.2g} % of the curve's range of {figures['against']}: is the "
+            "unit in the name of its first column right?"
         )
     if frames := figures["tracked_frames_off_the_curve"]:
         lines.append(f"{len(frames)} tracked frames are not on the curve and were not compared: {_some(frames)}")

@@ -94,7 +94,7 @@ def error_facts(model: ReducedModel) -> Facts:
     reduction = main_errors(certificate)
     facts = {"reduction error": _in_words(reduction)}
     if "n_held_out" in certificate["displacement"]:
-        facts["reduction error"] += f", at {certificate['displacement']['n_held_out']} held-out solves"
+        facts["reduction error"] += f", at {_held_out(certificate['displacement']['n_held_out'], 'solve')}"
     discretisation = certificate.get("discretisation", _UNKNOWN_DISCRETISATION)
     if "not_estimated" in discretisation:
         unknown = f"not estimated: {discretisation['not_estimated']}"
@@ -103,7 +103,7 @@ def error_facts(model: ReducedModel) -> Facts:
     coarse, finer = discretisation["unknowns"]
     facts = {
         "total error": _in_words({name: errors[name] + reduction.get(name, 0.0) for name in errors}),
-        "discretisation error": f"{_in_words(errors)}, at {len(states)} held-out states solved again",
+        "discretisation error": f"{_in_words(errors)}, at {_held_out(len(states), 'state')} solved again",
         **facts,
         "finer elements": f"{discretisation['method']}; {finer} unknowns in place of {coarse}",
     }
@@ -113,6 +113,10 @@ def error_facts(model: ReducedModel) -> Facts:
         facts["states left out"] = discretisation["left_out"]
     described = [describe_point(model.parameters, state) for state in states]
     return facts | {f"state solved again {n}": text for n, text in enumerate(described, start=1)}
+
+
+def _held_out(count: int, what: str) -> str:
+    return f"{count} held-out {what}{'' if count == 1 else 's'}"
 
 
 def _as_parameters(model: ReducedModel, errors: Mapping[str, Any]) -> str:

@@ -17,5 +17,5 @@ from morph_dslam.studies.snapshots import (
     snapshot_key as snapshot_key,
 )
 from morph_dslam.studies.solid_study import SolidStudy as SolidStudy
-from morph_dslam.studies.study import Study as Study, mesh_of_file as mesh_of_file
+from morph_dslam.studies.study import Study as Study, mesh_notes as mesh_notes, mesh_of_file as mesh_of_file
 from morph_dslam.studies.sweep import run_sweep as run_sweep

@@ -66,7 +66,7 @@ def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]
     }
     if isinstance(measurement, MeasuredForces):
         units = {p.name: p for p in measurement.model.parameters}
-        rates = measurement.loading_rates.items()
+        rates = [(n, rate) for n, rate in measurement.loading_rates.items() if n not in identified]
         figures |= {"support": measurement.compared.support, "direction": measurement.compared.direction}
         figures |= {"left_out": measurement.left_out}
         figures |= {"why": f"they are {measurement.why_left_out}"} if measurement.left_out else {}

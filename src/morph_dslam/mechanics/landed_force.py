@@ -6,6 +6,7 @@ Their densities are those of a load on an endless plane, so that what would act 
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
@@ -36,6 +37,30 @@ def smallest_cell(mesh: Mesh, faces: Indices) -> float:
         diagonals = np.cross(second, corners[:, 3] - corners[:, 1])
         doubled = np.where(nodes[:, 3] >= 0, np.linalg.norm(diagonals, axis=1) / 2.0, doubled)
     return float(np.sqrt(doubled.min()))
+
+
+def nearest_point(triangles: Array, point: Array) -> Array:
+    """The point (3,) of a surface of triangles (t, 3, 3) that is nearest to ``point`` (3,)."""
+    feet = trimesh.triangles.closest_point(triangles, np.repeat(point[None], len(triangles), axis=0))
+    return np.asarray(feet[np.linalg.norm(feet - point, axis=1).argmin()])
+
+
+def distance_from_rim(nodes: Array, triangles: Indices, point: Array) -> float:
+    """How far ``point`` (3,) is from the nearest edge of one triangle alone; infinite where the surface is closed.
+
+    Parameters
+    ----------
+    nodes : (n, 3) m.
+    triangles : (t, 3) of node indices.
+    """
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, counts = np.unique(edges, axis=0, return_counts=True)
+    start, stop = nodes[edges[counts == 1].T]
+    if not len(start):
+        return float("inf")
+    along = stop - start
+    where = np.einsum("ex,ex->e", point - start, along) / np.maximum(np.einsum("ex,ex->e", along, along), 1e-300)
+    return float(np.linalg.norm(start + np.clip(where, 0.0, 1.0)[:, None] * along - point, axis=1).min())
 
 
 def share_of_patch(triangles: Array, centre: Array, width: float) -> float:

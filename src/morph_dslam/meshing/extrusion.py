@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.generators import with_surfaces
-from morph_dslam.meshing.mesh_checks import MOST_CELLS
+from morph_dslam.meshing.mesh_checks import MOST_CELLS, described_extent
 from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces
 from morph_dslam.meshing.second_order import to_second_order
 
@@ -108,7 +108,11 @@ def _check(corners: Array, thickness: float, size: float, cell_type: str, layers
     area = 0.5 * abs(float(np.sum(corners[:, 0] * ends[:, 1] - ends[:, 0] * corners[:, 1])))
     count = 2.3 * area / size**2 * layers  # of triangles with equal sides
     if count > MOST_CELLS:
-        raise StudyError(f"a size of {1e3 * size:.3g} mm makes some {count:.1g} cells; {MOST_CELLS} are the most")
+        extent = described_extent(1e3 * np.ptp(corners, axis=0))
+        raise StudyError(
+            f"the outline measures {extent} mm, and cells of size = {1e3 * size:.3g} mm would be some {count:.1g} "
+            f"cells, of {MOST_CELLS} at most: its unit is probably wrong, or the size is too small"
+        )
 
 
 def _shown(point: Array) -> str:

@@ -18,7 +18,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
-from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_cavities
+from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_found_surfaces
 from morph_dslam.meshing.netgen_meshing import (
     SURFACES,
     check_watertight,
@@ -58,11 +58,11 @@ def load_mesh(path: Path | str, unit: str, size: float | None = None) -> Mesh:
     if size is not None and kind not in (*SURFACES, ".step"):
         raise StudyError(f"{path} is meshed already; a cell size is for surfaces and STEP files")
     if kind in SURFACES:
-        return with_cavities(mesh_surface_file(path, scale, size))
+        return with_found_surfaces(mesh_surface_file(path, scale, size))
     if kind == ".step":
-        return with_cavities(mesh_step_file(path, unit, None if size is None else size * 1e3).scaled(1e-3))
+        return with_found_surfaces(mesh_step_file(path, unit, None if size is None else size * 1e3).scaled(1e-3))
     mesh = _mesh_from_inp(read_inp(path)) if kind == ".inp" else _read_with_meshio(path)
-    return with_cavities(reoriented(without_collapsed_cells(mesh)).scaled(scale))
+    return with_found_surfaces(reoriented(without_collapsed_cells(mesh)).scaled(scale))
 
 
 def load_surface_mesh(path: Path | str, unit: str) -> Mesh:

@@ -62,6 +62,7 @@ class Mesh:
     node_sets : node indices by name.
     cell_sets : cell indices by name; materials are given by cell set, and "all" always means every cell.
     surfaces : faces by name, (f, 2): cell index and local face number, the position in `CellType.faces`.
+    found : names of surfaces that follow from nodes and cells, and that a file need not name: flat ends, cavities.
     """
 
     nodes: Array
@@ -69,6 +70,7 @@ class Mesh:
     node_sets: Mapping[str, Indices] = field(default_factory=dict)
     cell_sets: Mapping[str, Indices] = field(default_factory=dict)
     surfaces: Mapping[str, Indices] = field(default_factory=dict)
+    found: frozenset[str] = frozenset()
 
     @property
     def n_nodes(self) -> int:
@@ -266,13 +268,20 @@ def end_surfaces(mesh: Mesh) -> dict[str, Indices]:
     return {name: ends for name, ends in found.items() if len(ends)}
 
 
-def with_cavities(mesh: Mesh) -> Mesh:
-    """A solid mesh with the walls of its closed cavities as surfaces "cavity_1", ..., in the order of their centres.
+def with_found_surfaces(mesh: Mesh) -> Mesh:
+    """A solid mesh with its flat ends (`end_surfaces`) and the walls of its closed cavities as surfaces.
 
-    Centres are ordered along x, then y, then z. Names that the mesh has already stay what they are.
+    Names that the mesh has already stay what they are; the others are in ``found``.
     """
     if any(block.type.dimension == 2 for block in mesh.blocks) or not mesh.n_cells:
         return mesh
+    named = {*mesh.surfaces, *mesh.node_sets, *mesh.cell_sets}
+    new = {name: faces for name, faces in (end_surfaces(mesh) | _cavities(mesh)).items() if name not in named}
+    return replace(mesh, surfaces={**mesh.surfaces, **new}, found=mesh.found | new.keys())
+
+
+def _cavities(mesh: Mesh) -> dict[str, Indices]:
+    """Walls of closed cavities, "cavity_1", ..., in the order of their centres along x, then y, then z."""
     faces = mesh.boundary_faces()
     nodes = mesh.face_nodes(faces, corners_only=True)
     pairs = [nodes[nodes[:, k] >= 0][:, [0, k]] for k in range(1, nodes.shape[1])]
@@ -287,8 +296,7 @@ def with_cavities(mesh: Mesh) -> Mesh:
         if np.linalg.det(corners).sum() < 0.0:
             found.append((np.round(corners.mean(axis=(0, 1)) / np.ptp(mesh.nodes), 6).tolist(), wall))
     found.sort(key=lambda each: each[0])
-    cavities = {f"cavity_{number}": wall for number, (_, wall) in enumerate(found, start=1)}
-    return replace(mesh, surfaces={**cavities, **mesh.surfaces}) if cavities else mesh
+    return {f"cavity_{number}": wall for number, (_, wall) in enumerate(found, start=1)}
 
 
 def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:

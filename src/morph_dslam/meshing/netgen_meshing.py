@@ -26,6 +26,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.mesh_checks import check_extent, described_extent
 from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces, find_faces
+from morph_dslam.meshing.surface_repair import repaired_surface
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -148,6 +149,31 @@ def check_watertight(surface: _TriangleSurface, path: Path) -> None:
         raise StudyError(f"the triangles of {path} face inwards; flip its normals")
 
 
+def closed_surface(path: Path) -> tuple[_TriangleSurface, dict[str, int]]:
+    """Read a surface that bounds a body; one that does not is mended (`repaired_surface`).
+
+    Raises StudyError as `read_surface` does, or if the surface still bounds no volume.
+
+    Returns
+    -------
+    surface : as the file has it if nothing had to be mended.
+    repairs : how often each was done, by its name.
+    """
+    surface = read_surface(path)
+    try:
+        check_watertight(surface, path)
+        return surface, {}
+    except StudyError as error:
+        flaw = error
+    try:
+        points, triangles, repairs = repaired_surface(surface.points, surface.triangles)
+    except StudyError:
+        raise flaw from None
+    mended = _TriangleSurface(points, triangles)
+    check_watertight(mended, path)
+    return mended, repairs
+
+
 #: STEP length units as the file names them, by ours.
 _STEP_UNITS = {"mm": r"\.MILLI\.", "cm": r"\.CENTI\.", "m": r"\$"}
 
@@ -196,8 +222,8 @@ def _volume_mesh(content: Any, path: Path) -> Mesh:
 def mesh_surface_file(path: Path, unit: float, size: float | None) -> Mesh:
     """Fill a closed surface with tetrahedra; the mesh is in metres.
 
-    Raises StudyError if the surface is unreadable, not closed, or cannot be filled, or the size of cells goes with no
-    body of its extent.
+    Raises StudyError if the surface is unreadable, is not closed and cannot be mended (`closed_surface`), or cannot be
+    filled, or the size of cells goes with no body of its extent.
 
     Parameters
     ----------
@@ -211,8 +237,7 @@ def mesh_surface_file(path: Path, unit: float, size: float | None) -> Mesh:
     Mesh
         Surfaces "face_1", ..., one for each smooth part of a surface meshed anew.
     """
-    surface = read_surface(path)
-    check_watertight(surface, path)
+    surface, _ = closed_surface(path)
     if size is not None:
         a, b, c = unit * surface.points[surface.triangles].transpose(1, 0, 2)
         volume = float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0

@@ -16,6 +16,7 @@ from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.io.writing import writing
+from morph_dslam.meshing.mesh_notes import many_cells_note
 from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
 from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
@@ -34,7 +35,7 @@ from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
-from morph_dslam.studies.study import Study, load_study
+from morph_dslam.studies.study import Study, load_study, study_mesh_notes
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 
 #: Fewer held-out solutions than these say nothing of the error.
@@ -117,10 +118,10 @@ def build(
 
 def _built(study: Study, text: str, output: Path, workers: int | None, executor: Executor | None) -> ReducedModel:
     begin = time.monotonic()
-    chosen = resolve_defaults(study)
+    chosen, mesh_notes = resolve_defaults(study), []
     if isinstance(chosen, SolidStudy | ShellStudy):
         chosen.check_parameters_used()
-        _announce_mesh(chosen)
+        mesh_notes = _announce_mesh(chosen)
     snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
     _check_held_out(chosen, snapshots, output)
     model = certified_model(snapshots, chosen.reduction, chosen.name, _fallback(study.reduction))
@@ -134,7 +135,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
     doubts = _unstrained(snapshots) or _doubtful(model)
-    if found := [*_unresolved(chosen, snapshots), *study_warnings(chosen), *doubts]:
+    if found := [*mesh_notes, *_unresolved(chosen, snapshots), *study_warnings(chosen), *doubts]:
         model.certificate["warnings"] = found
     with writing(StudyError, output):
         save_model(output, model)
@@ -146,10 +147,11 @@ def _kept_in(output: Path) -> Path:
     return output.with_name(output.name + ".snapshots")
 
 
-def _announce_mesh(study: SolidStudy | ShellStudy) -> None:
+def _announce_mesh(study: SolidStudy | ShellStudy) -> list[str]:
     """Print how large the mesh is, for a wrong unit shows there before anything is solved, and which faces were chosen.
 
     Chosen are those of the study's own sets, and of node sets, or of several sets, that it names as one surface.
+    Returned are sentences, printed too, on how the mesh differs from its file.
     """
     mesh = study.solid_mesh() if isinstance(study, SolidStudy) else study.shell_mesh()
     announce(f"mesh: {described_mesh(mesh)}")
@@ -157,6 +159,10 @@ def _announce_mesh(study: SolidStudy | ShellStudy) -> None:
         for name in mesh.surfaces.keys() - make_mesh(study.mesh).surfaces.keys():
             area, _, _ = faces_figures(mesh, mesh.surfaces[name])
             announce(f"mesh: the surface {name} is {len(mesh.surfaces[name])} faces, {1e6 * area:.4g} mm2")
+    notes = study_mesh_notes(study, mesh)
+    for note in (*notes, *many_cells_note(mesh)):
+        announce(f"note: {note}")
+    return notes
 
 
 def _unstrained(snapshots: Snapshots) -> list[str]:

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.landed_force import share_of_line, share_of_patch, smallest_cell
+from morph_dslam.mechanics.landed_force import (
+    distance_from_rim,
+    nearest_point,
+    share_of_line,
+    share_of_patch,
+    smallest_cell,
+)
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
@@ -26,6 +32,10 @@ NARROWEST = 0.5
 LANDED = 0.95
 #: A part that rounds to none of it.
 NONE = 0.005
+#: Widths from a rim within which it is to blame, and from the surface beyond which the centre's place is.
+AT_RIM, OFF_SURFACE = 2.0, 0.1
+#: States beside the default and the ends of ranges in which a load may come near the object.
+TRIED = 64
 
 
 def check_widths(loads: Sequence[Any], mesh: Mesh) -> None:
@@ -38,6 +48,37 @@ def check_widths(loads: Sequence[Any], mesh: Mesh) -> None:
                 f"which measures {1e3 * size:.4g} mm, and the force would be lost between points of integration: make "
                 f"it {1e3 * NARROWEST * size:.4g} mm at least, or the cells smaller"
             )
+
+
+def check_reach(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter]) -> None:
+    """Refuse moving loads that stay farther from their surface than the mesh is long (StudyError): a wrong unit.
+
+    Looked at are the defaults, the ends of the parameters' ranges and states spread within.
+    """
+    length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    within = np.random.default_rng(0).uniform(size=(TRIED, len(parameters)))
+    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
+    states = [np.array([p.default for p in parameters]), *(lower + within * (upper - lower))]
+    states += [mu for _, mu in range_ends(parameters, list(range(len(parameters))), True)]
+    for where, load in _moving(loads):
+        nodes = mesh.nodes[np.unique(mesh.face_triangles(_faces(mesh, load.on)))]
+        centre = [read_affine(value, "length", parameters) for value in load.centre]
+        places = np.unique([[c(mu) for c in centre] for mu in states], axis=0)
+        distance = min(float(_distances(load, nodes, place).min()) for place in places)
+        if distance > length:
+            raise StudyError(
+                f"{where}: its centre stays {1e3 * distance:.4g} mm or more away from '{load.on}', and the mesh is "
+                f"{1e3 * length:.4g} mm long: check the units of the centre and of the mesh"
+            )
+
+
+def _distances(load: Moving, nodes: Array, centre: Array) -> Array:
+    """Of nodes (n, 3) from the centre of a patch, or from the line through that of a line."""
+    arms = nodes - centre
+    if isinstance(load, MovingLineLoad):
+        unit = np.array(load.direction) / np.linalg.norm(load.direction)
+        arms = arms - np.outer(arms @ unit, unit)
+    return np.linalg.norm(arms, axis=1)
 
 
 def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter], shape: Shape = ()) -> list[str]:
@@ -58,11 +99,28 @@ def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Para
             state = state_text([parameters[k] for k in used], states[worst][used])
             at = f" where {state}" if used else ""
             landed = f"only {100.0 * shares[worst]:.0f} %" if shares[worst] > NONE else "nothing"
-            found.append(
-                f"{where}: {landed} of the force lands on '{load.on}'{at}, and the rest falls beside it: keep the "
-                "centre about two widths away from the rim"
-            )
+            place = np.array([c(states[worst]) for c in centre])
+            why = _why_beside(load, moved_nodes(mesh, shape, states[worst]), faces, place)
+            found.append(f"{where}: {landed} of the force lands on '{load.on}'{at}{why}")
     return found
+
+
+def _why_beside(load: Moving, nodes: Array, faces: NDArray[np.int64], centre: Array) -> str:
+    """What takes force from a load at ``centre`` (3,), and what to do, to end a sentence.
+
+    A rim does within two widths; farther away a patch is off the surface, or the surface bends away from it.
+    """
+    rim = ", and the rest falls beside it: keep the centre about two widths away from the rim"
+    if isinstance(load, MovingLineLoad):
+        return rim
+    foot = nearest_point(nodes[faces], centre)
+    off = float(np.linalg.norm(foot - centre))
+    if distance_from_rim(nodes, faces, foot) < AT_RIM * load.width:
+        return rim
+    if off < OFF_SURFACE * load.width:
+        return ", which bends away from the patch, as at a corner: move its centre, or take a smaller width"
+    place = ", ".join(f"{x + 0.0:.4g}" for x in np.round(1e3 * foot, 3))
+    return f", for its centre lies {1e3 * off:.2g} mm off the surface: put it on it, at ({place}) mm say"
 
 
 def _moving(loads: Sequence[Any]) -> Iterator[tuple[str, Moving]]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.writing import writing
-from morph_dslam.meshing.mesh_checks import check_extent, described_extent
+from morph_dslam.meshing.mesh_checks import check_extent
+from morph_dslam.meshing.mesh_notes import small_extent_note
 from morph_dslam.meshing.netgen_meshing import read_surface
 from morph_dslam.meshing.surface_repair import refined_surface, repaired_surface
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
@@ -19,8 +20,6 @@ from morph_dslam.units import to_si
 
 #: Edges of the model are at most this share of the diagonal long: a picture is drawn as flat within each triangle.
 LONGEST_EDGE = 1.0 / 24.0
-#: The diagonal of an object that registration would call unusually small, metres.
-UNUSUALLY_SMALL = 0.005
 
 
 def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None) -> ReducedModel:
@@ -49,9 +48,8 @@ def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None
         points, triangles, repairs = repaired_surface(found.points, found.triangles)
     except StudyError as error:
         raise StudyError(f"{path} describes no surface: {error}; save it again as a triangulated surface") from error
-    if np.linalg.norm(extent) < UNUSUALLY_SMALL:
-        size = described_extent(1e3 * extent)
-        announce(f"warning: {path} measures {size} mm; if that is not so, '{unit}' is not the unit it was drawn in")
+    for note in small_extent_note(extent, path, unit):
+        announce(f"warning: {note}")
     points, triangles = refined_surface(points, triangles, LONGEST_EDGE * float(np.linalg.norm(np.ptp(points, axis=0))))
     none = np.empty(0)
     constant = ParameterFunctions(none, none, np.zeros((1, 0), dtype=np.int64), np.ones((1, 1)))

@@ -113,7 +113,14 @@ class SetSection(Section):
 
 
 def with_sets(mesh: Mesh, sets: Mapping[str, SetSection]) -> Mesh:
-    """The mesh with the sets of a study. Raises StudyError if one of them is empty, or the mesh has one of its name."""
+    """The mesh with the sets of a study, which may replace surfaces that its file does not name.
+
+    Raises StudyError if one of them is empty, or the mesh has one of its name.
+    """
+    own = mesh.found & sets.keys()
+    if own:  # what the study says of a name counts
+        kept = {name: faces for name, faces in mesh.surfaces.items() if name not in own}
+        mesh = replace(mesh, surfaces=kept, found=mesh.found - own)
     for name in sets:
         if name == "all" or any(name in known for known in (mesh.node_sets, mesh.cell_sets, mesh.surfaces)):
             raise StudyError(f"sets.{name}: the mesh has a set of this name; choose another")

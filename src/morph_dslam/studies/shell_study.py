@@ -21,7 +21,7 @@ from morph_dslam.studies.body_study import (
     reader_of,
     with_named_sets,
 )
-from morph_dslam.studies.moving_loads import check_widths, landing_warnings
+from morph_dslam.studies.moving_loads import check_reach, check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
@@ -117,6 +117,7 @@ class ShellStudy(BodyStudy, Section):
         """The discretised shell, with the study's own elements if ``options`` name no others."""
         symbols, mesh = ParameterSymbols(self.model_parameters()), self.shell_mesh()
         check_widths(self.loads, mesh)
+        check_reach(self.loads, mesh, symbols.parameters)
         check_symmetry(self.supports, mesh)
         read = reader_of(symbols)
         return ShellProblem(

@@ -210,12 +210,12 @@ def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
 
 
 def mesh_fingerprint(mesh: Mesh) -> str:
-    """Hash of nodes, cells and sets."""
+    """Hash of nodes, cells and those sets that do not follow from them."""
     digest = hashlib.sha256(np.ascontiguousarray(mesh.nodes).tobytes())
     for block in mesh.blocks:
         digest.update(block.cell_type.encode() + np.ascontiguousarray(block.connectivity).tobytes())
     for sets in (mesh.node_sets, mesh.cell_sets, mesh.surfaces):
-        for name in sorted(sets):
+        for name in sorted(sets.keys() - (mesh.found if sets is mesh.surfaces else ())):
             digest.update(name.encode() + np.ascontiguousarray(sets[name], dtype=np.int64).tobytes())
     return digest.hexdigest()
 

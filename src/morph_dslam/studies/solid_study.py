@@ -32,7 +32,7 @@ from morph_dslam.studies.body_study import (
     with_named_sets,
 )
 from morph_dslam.studies.material_sections import MaterialSection
-from morph_dslam.studies.moving_loads import check_widths, landing_warnings
+from morph_dslam.studies.moving_loads import check_reach, check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
 from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
@@ -241,6 +241,7 @@ class SolidStudy(BodyStudy, Section):
         """The discretised solid, with the study's own elements if ``options`` name no others."""
         parameters, mesh = self.model_parameters(), self.solid_mesh()
         check_widths(self.loads, mesh)
+        check_reach(self.loads, mesh, parameters)
         symbols = ParameterSymbols(parameters)
         reader = reader_of(symbols)
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)

@@ -16,6 +16,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.sections import explain
 from morph_dslam.io.text import read_toml
 from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.mesh_notes import file_notes
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.set_sections import with_sets
@@ -81,6 +82,28 @@ def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
     if isinstance(study, ShellStudy):
         return with_sets(shell_mesh(study.mesh), study.sets)
     raise StudyError(f"{path} has no [mesh]: sheets in grips and solutions of other programs have no sets to name")
+
+
+def mesh_notes(path: Path, unit: str, size: float | None, mesh: Mesh) -> list[str]:
+    """Sentences on the ``mesh`` that `mesh_of_file` has made: how far it is from its file, what was mended.
+
+    Parameters
+    ----------
+    path, unit, size : those of `mesh_of_file`.
+    mesh : the result.
+    """
+    if path.suffix != ".toml":
+        return file_notes(mesh, path, unit, None if size is None else to_si(size, unit, "length"))
+    study = load_study(path)
+    return study_mesh_notes(study, mesh) if isinstance(study, SolidStudy | ShellStudy) else []
+
+
+def study_mesh_notes(study: SolidStudy | ShellStudy, mesh: Mesh) -> list[str]:
+    """The same of the ``mesh`` of a study; none where a generator makes it."""
+    section: Any = study.mesh
+    if getattr(section, "file", None) is None:
+        return []
+    return file_notes(mesh, section.file, section.unit, getattr(section, "size", None))
 
 
 def _kind(content: Mapping[str, Any]) -> type[Study]:

@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 SOUGHT_IN = 6
 #: States for each term of a polynomial of second order; the highest order tried, with this many terms a state.
 STATES_A_TERM, HIGHEST_DEGREE, MOST_TERMS_A_STATE = 3, 4, 0.7
+#: A load that acts to less than this share where the body can move acts on what supports hold.
+ON_MOVING = 0.15
 #: Relative norm of the responses' fields that may be left out, and most functions of the parameters.
 TOLERANCE, MOST_FUNCTIONS = 2e-2, 12
 
@@ -83,9 +85,10 @@ def reduce_unknown_loads(
     else:
         found = [softest_tractions(surface, problem.response(state), section.modes) for state in states]
         tractions = common_tractions(surface, found, section.modes)
-    energies = np.diag(surface.compliance(tractions, problem.response(states[0]))[0])
+    compliance, changes = surface.compliance(tractions, problem.response(states[0]))
+    energies = np.diag(compliance)
     # Loads at places that supports hold move nothing, and have no size that they could be measured by.
-    moving = energies > SOFTLESS * energies.max()
+    moving = (energies > SOFTLESS * energies.max()) & (_moving_share(surface, tractions, changes) >= ON_MOVING)
     tractions = tractions[moving] / np.sqrt(energies[moving])[:, None, None]
     responses: dict[str, list[NDArray]] = {}
     for file in tqdm(samples.files, desc="responses to loads", unit="state"):
@@ -113,6 +116,12 @@ def reduce_unknown_loads(
         "states": len(samples.files),
         "response_error": reduced["displacement"][1],
     }
+
+
+def _moving_share(surface: LoadedSurface, tractions: Array, changes: Array) -> Array:
+    """The part (c,) of tractions (c, a, k) that acts at dofs which any of their responses (c, n_dofs) moves."""
+    loads = np.abs(surface.loads(tractions))
+    return loads[:, (changes != 0.0).any(axis=0)].sum(axis=1) / loads.sum(axis=1)
 
 
 class _Samples:
