@@ -125,7 +125,7 @@ def redundancy(rigid_map: RigidMap, numbers: Indices) -> NDArray[np.float64]:
 #: Map points that are found in a smaller share of the frames that should show them are taken out.
 LEAST_FOUND = 0.1
 #: Iterations of local bundle adjustment, and after how many of them it pauses.
-LOCAL_ITERATIONS, LOCAL_PAUSE = 10, 3
+LOCAL_ITERATIONS, LOCAL_PAUSE = 10, 4
 
 
 class Mapper:
