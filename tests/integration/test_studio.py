@@ -149,7 +149,10 @@ def test_forms_and_the_text_change_the_same_study(client, folder):
     client.call("change_study", section="supports", key=0, value={"kind": "fixed", "on": "foot"})
     move = {"kind": "displacement", "on": "head", "x": "push", "y": "0 mm", "z": "0 mm"}
     found = client.call("change_study", section="supports", key=1, value=move)
-    assert (found["problems"], found["sets"]) == ([], ["foot", "head"])
+    assert found["problems"] == []
+    # The picked ones, and the flat ends that a mesh has by itself.
+    ends = [f"{axis}_{end}" for axis in "xyz" for end in ("max", "min")]
+    assert found["sets"] == ["foot", "head", *ends]
     assert "# kept" in found["text"]
     study = load_study(folder / "study.toml")
     assert [support.on for support in study.supports] == ["foot", "head"]
