@@ -8,17 +8,11 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import main
-from morph_dslam.evaluation.depth import (
-    RIM_PX,
-    DepthError,
-    depth_error,
-    distances_to_surface,
-    read_depths,
-    summarise_depth,
-)
+from morph_dslam.evaluation.depth import RIM_PX, DepthError, depth_error, read_depths, summarise_depth
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import plot_depth_errors_by_frame
 from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.surface_distances import distances_to_surface
 from tests.support.run_folders import CAMERA, write_run
 
 

@@ -1,6 +1,5 @@
 """The blocks of a report page, and the lines that sum up a run and its evaluation."""
 
-from morph_dslam.evaluation.depth import distances_to_surface as distances_to_surface
 from morph_dslam.evaluation.evaluate import evaluate_force as evaluate_force, evaluate_pixels as evaluate_pixels
 from morph_dslam.evaluation.force import (
     force_line as force_line,
@@ -39,4 +38,5 @@ from morph_dslam.evaluation.run_folder import (
     result_line as result_line,
 )
 from morph_dslam.evaluation.trajectory import trajectory_line as trajectory_line
+from morph_dslam.surface_distances import distances_to_surface as distances_to_surface
 from morph_dslam.tracking.observability import value_line as value_line

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.ngsolve_mesh import Combinations, NgsolveMesh, region_name
-from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.meshing.surface_checks import mesh_edges
 
 Array = NDArray[np.float64]
@@ -106,5 +106,5 @@ class SurfaceMesh(NgsolveMesh):
 def _with_surfaces(mesh: Mesh) -> Mesh:
     """The mesh with its cell sets, and all cells, as surfaces: a surface cell is its own face."""
     sets = {"all": np.arange(mesh.n_cells), **mesh.cell_sets}
-    surfaces = {name: np.column_stack([cells, np.zeros_like(cells)]) for name, cells in sets.items()}
+    surfaces = {name: faces_of_cells(cells) for name, cells in sets.items()}
     return replace(mesh, surfaces={**surfaces, **mesh.surfaces})

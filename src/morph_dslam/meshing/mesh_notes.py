@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.mesh_checks import described_extent
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.meshing.netgen_meshing import SURFACES, closed_surface
+from morph_dslam.surface_distances import distances_to_surface
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
@@ -26,8 +25,6 @@ UNUSUALLY_SMALL = 0.005
 OFF_FILE = 0.005
 #: More cells than these are seldom meant: a study is solved dozens of times.
 MANY_CELLS = 20_000
-#: Pairs of a point and a triangle whose distances are computed at once.
-_CHUNK = 200_000
 
 
 @dataclass(frozen=True)
@@ -61,26 +58,11 @@ def surface_deviation(mesh: Mesh, points: Array, triangles: Indices) -> SurfaceD
     points : (n, 3) of the file, metres.
     triangles : (t, 3) of the file.
     """
-    corners = mesh.nodes[mesh.surface_triangles()]
-    distances = distances_from(points[np.unique(triangles)], corners)
+    outer = mesh.surface_triangles()
+    distances = distances_to_surface(points[np.unique(triangles)], mesh.nodes, outer)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    volume = _volume(corners) / _volume(points[triangles]) - 1.0
+    volume = _volume(mesh.nodes[outer]) / _volume(points[triangles]) - 1.0
     return SurfaceDeviation(volume, float(distances.max()), float(distances.mean()), diagonal)
-
-
-def distances_from(points: Array, corners: Array) -> Array:
-    """Distances (n,) of points (n, 3) from the nearest of triangles with ``corners`` (t, 3, 3)."""
-    centres = corners.mean(axis=1)
-    radius = float(np.linalg.norm(corners - centres[:, None], axis=2).max())
-    bounds = KDTree(corners.reshape(-1, 3)).query(points)[0]
-    near = KDTree(centres).query_ball_point(points, bounds + radius * (1.0 + 1e-9))
-    which = np.repeat(np.arange(len(points)), [len(found) for found in near])
-    of = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
-    result = np.full(len(points), np.inf)
-    for part in np.array_split(np.arange(len(of)), max(1, len(of) // _CHUNK)):
-        closest = trimesh.triangles.closest_point(corners[of[part]], points[which[part]])
-        np.minimum.at(result, which[part], np.linalg.norm(closest - points[which[part]], axis=1))
-    return np.minimum(result, bounds)
 
 
 def _volume(corners: Array) -> float:
@@ -100,8 +82,7 @@ def file_notes(mesh: Mesh, path: Path, unit: str, size: float | None = None) -> 
     size : longest edge of a cell where its volume was meshed, metres; None if its triangles were kept.
     """
     notes = []
-    solid = all(block.type.dimension == 3 for block in mesh.blocks)
-    if solid and file_kind(path) in SURFACES:
+    if not mesh.is_sheet and file_kind(path) in SURFACES:
         notes += _surface_notes(mesh, path, to_si(1.0, unit, "length"), size)
     return [*notes, *small_extent_note(np.ptp(mesh.nodes, axis=0), path, unit)]
 

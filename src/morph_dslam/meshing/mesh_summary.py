@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.meshing.meshes import Mesh, natural_order
+from morph_dslam.meshing.meshes import Mesh, faces_of_cells, natural_order
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -52,11 +52,10 @@ def set_rows(mesh: Mesh) -> list[list[str]]:
     A node set of the name of a surface is left out. Cell sets of sheets have an area and a normal, those of solids not.
     """
     rows = [_face_row(name, "faces", mesh, mesh.surfaces[name]) for name in _ordered(mesh.surfaces)]
-    sheet = all(block.type.dimension == 2 for block in mesh.blocks)
     for name in _ordered(mesh.cell_sets):
         cells = mesh.cell_sets[name]
-        if sheet:
-            rows.append(_face_row(name, "cells", mesh, np.column_stack([cells, np.zeros_like(cells)])))
+        if mesh.is_sheet:
+            rows.append(_face_row(name, "cells", mesh, faces_of_cells(cells)))
         else:
             rows.append([name, "cells", str(len(cells)), "", "", ""])
     for name in _ordered({key: nodes for key, nodes in mesh.node_sets.items() if key not in mesh.surfaces}):

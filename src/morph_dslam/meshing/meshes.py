@@ -80,6 +80,11 @@ class Mesh:
     def n_cells(self) -> int:
         return sum(len(block.connectivity) for block in self.blocks)
 
+    @property
+    def is_sheet(self) -> bool:
+        """Whether its cells are those of a surface."""
+        return all(block.type.dimension == 2 for block in self.blocks)
+
     def block_starts(self) -> Indices:
         """Index of each block's first cell, and the number of cells at the end."""
         return np.cumsum([0, *(len(block.connectivity) for block in self.blocks)])
@@ -107,9 +112,9 @@ class Mesh:
         """
         if name in self.surfaces or name not in self.node_sets:
             return self._named(self.surfaces, name, "surface", self.node_sets)
-        outer = self.boundary_faces()
-        nodes = self.face_nodes(outer)
-        found = outer[(np.isin(nodes, self.node_sets[name]) | (nodes < 0)).all(axis=1)]
+        inside = np.zeros(self.n_nodes, dtype=bool)
+        inside[self.node_sets[name]] = True
+        found = self.faces_within(self.boundary_faces(), inside)
         if not len(found):
             raise StudyError(
                 f"'{name}' is a node set that holds no whole face of the mesh: name a surface, or all nodes of a face"
@@ -158,6 +163,11 @@ class Mesh:
         _, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
         return faces[counts[inverse.ravel()] == 1]
 
+    def faces_within(self, faces: Indices, inside: NDArray[np.bool_]) -> Indices:
+        """Those of faces (f, 2) all of whose nodes are among those ``inside`` (n,)."""
+        nodes = self.face_nodes(faces)
+        return faces[(inside[nodes] | (nodes < 0)).all(axis=1)]
+
     def face_triangles(self, faces: Indices) -> Indices:
         """Triangles (t, 3) of node indices over faces (f, 2), through middle nodes, turning as they do."""
         nodes = self.face_nodes(faces)
@@ -196,18 +206,22 @@ class Mesh:
         return self.renumbered(np.where(used, np.cumsum(used) - 1, -1), self.nodes[used])
 
 
+def faces_of_cells(cells: Indices) -> Indices:
+    """Faces (m, 2) of cells (m,) of a sheet: each is its own."""
+    return np.column_stack([cells, np.zeros_like(cells)])
+
+
 #: Cells whose Jacobians are held at once.
 _CHUNK = 4096
 
 
 def model_mesh_of(mesh: Mesh) -> ModelMesh:
     """All nodes, the outer surface in triangles, and, for solids, the cells."""
-    solid = all(block.type.dimension == 3 for block in mesh.blocks)
     return ModelMesh(
         nodes=mesh.nodes,
         triangles=mesh.surface_triangles(),
         weights=lumped_weights(mesh),
-        cells=cells_by_type(mesh) if solid else {},
+        cells={} if mesh.is_sheet else cells_by_type(mesh),
     )
 
 
@@ -273,7 +287,7 @@ def with_found_surfaces(mesh: Mesh) -> Mesh:
 
     Names that the mesh has already stay what they are; the others are in ``found``.
     """
-    if any(block.type.dimension == 2 for block in mesh.blocks) or not mesh.n_cells:
+    if mesh.is_sheet:
         return mesh
     named = {*mesh.surfaces, *mesh.node_sets, *mesh.cell_sets}
     new = {name: faces for name, faces in (end_surfaces(mesh) | _cavities(mesh)).items() if name not in named}

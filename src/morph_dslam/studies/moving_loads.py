@@ -16,7 +16,7 @@ from morph_dslam.mechanics.landed_force import (
     share_of_patch,
     smallest_cell,
 )
-from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
 from morph_dslam.studies.affine import read_affine
@@ -134,8 +134,7 @@ def _faces(mesh: Mesh, name: str) -> NDArray[np.int64]:
     """Faces (f, 2) of a surface of a solid or of a cell set of a shell."""
     if name in mesh.surfaces:
         return mesh.surface(name)
-    cells = mesh.cells(name)
-    return np.column_stack([cells, np.zeros_like(cells)])
+    return faces_of_cells(mesh.cells(name))
 
 
 def _share(load: Moving, triangles: Array, centre: Array) -> float:

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_summary import unit_normals
-from morph_dslam.meshing.meshes import Mesh
+from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.studies.sections import JOINED, Angle, Length, Number, PositiveLength, Section, SetName
 
 Array = NDArray[np.float64]
@@ -81,7 +81,8 @@ class SetSection(Section):
         faces = self._faces(mesh, inside)
         if self.chooses_faces:
             if not len(faces):
-                raise StudyError(f"no {_face_word(mesh)} of the mesh has all its nodes in there and faces so; widen it")
+                face = "cell" if mesh.is_sheet else "outer face"
+                raise StudyError(f"no {face} of the mesh has all its nodes in there and faces so; widen it")
             nodes = mesh.face_nodes(faces)
             return _with(mesh, name, faces, np.unique(nodes[nodes >= 0]))
         middles = np.concatenate([mesh.nodes[block.connectivity].mean(axis=1) for block in mesh.blocks])
@@ -94,8 +95,7 @@ class SetSection(Section):
             faces = mesh.boundary_faces()
         else:
             faces = np.unique(np.concatenate([_faces_named(mesh, part) for part in self.of.split(JOINED)]), axis=0)
-        nodes = mesh.face_nodes(faces)
-        faces = faces[(inside[nodes] | (nodes < 0)).all(axis=1)]
+        faces = mesh.faces_within(faces, inside)
         if self.facing is None or not len(faces):
             return faces
         direction = np.array(self.facing) / np.linalg.norm(self.facing)
@@ -132,20 +132,9 @@ def with_sets(mesh: Mesh, sets: Mapping[str, SetSection]) -> Mesh:
     return mesh
 
 
-def _is_sheet(mesh: Mesh) -> bool:
-    return all(block.type.dimension == 2 for block in mesh.blocks)
-
-
-def _face_word(mesh: Mesh) -> str:
-    return "cell" if _is_sheet(mesh) else "outer face"
-
-
 def _faces_named(mesh: Mesh, name: str) -> Indices:
     """Faces (f, 2) of a surface, of sheets those of a cell set. Raises StudyError if there is none of this name."""
-    if not _is_sheet(mesh):
-        return mesh.faces_in(name)
-    cells = mesh.cells(name)
-    return np.column_stack([cells, np.zeros_like(cells)])
+    return faces_of_cells(mesh.cells(name)) if mesh.is_sheet else mesh.faces_in(name)
 
 
 def _nearest(nodes: Array, point: Array, length: float) -> Indices:
@@ -163,9 +152,9 @@ def _with(
     mesh: Mesh, name: str, faces: Indices | None = None, nodes: Indices | None = None, cells: Indices | None = None
 ) -> Mesh:
     """The mesh with what a set holds; a sheet's faces are its cells. What is empty is no set."""
-    if _is_sheet(mesh) and cells is None and faces is not None:
+    if mesh.is_sheet and cells is None and faces is not None:
         cells = faces[:, 0]
-    surfaces = {name: faces} if faces is not None and len(faces) and not _is_sheet(mesh) else {}
+    surfaces = {name: faces} if faces is not None and len(faces) and not mesh.is_sheet else {}
     return replace(
         mesh,
         surfaces={**mesh.surfaces, **surfaces},
