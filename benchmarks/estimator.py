@@ -17,7 +17,7 @@ from morph_dslam import Camera, Parameter, ReducedModel
 from morph_dslam.extend.geometry import RigidTransform, cross_matrix, rotation_exp
 from morph_dslam.extend.models import ParameterFunctions, SeparatedField, SurfacePoints, total_degree_indices
 from morph_dslam.extend.tracking import BoundPoints, Estimator, State, moved
-from morph_dslam.tracking.estimator import project_with_jacobian
+from morph_dslam.tracking.reprojection import project_with_jacobian
 
 N_POINTS, N_MODES, DEGREE = 500, 16, 7
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)

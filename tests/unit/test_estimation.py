@@ -6,18 +6,9 @@ from scipy.optimize import least_squares
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.tracking.estimator import (
-    BoundPoints,
-    EstimationOptions,
-    Estimator,
-    Prior,
-    State,
-    linearise,
-    moved,
-    products_of_rows,
-    project_with_jacobian,
-)
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
+from morph_dslam.tracking.reprojection import linearise, products_of_rows, project_with_jacobian
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
-from morph_dslam.tracking import estimator
+from morph_dslam.tracking import reprojection
 
 _LOG = logging.getLogger("morph_dslam")
 
@@ -24,12 +24,12 @@ def announce_compilation() -> None:
 
 def _is_compiled() -> bool:
     """Whether the cache has the loop that all estimates run through; also where compiling is switched off."""
-    stats = getattr(estimator.linearise, "stats", None)
+    stats = getattr(reprojection.linearise, "stats", None)
     if stats is None:
         return True
     # Numba names the index of a compiled function by its first line: one of an older version does not count.
-    line = estimator.linearise.py_func.__code__.co_firstlineno
-    return any(Path(stats.cache_path).glob(f"estimator.linearise-{line}.*.nbi"))
+    line = reprojection.linearise.py_func.__code__.co_firstlineno
+    return any(Path(stats.cache_path).glob(f"reprojection.linearise-{line}.*.nbi"))
 
 
 def compile_drawing() -> None:

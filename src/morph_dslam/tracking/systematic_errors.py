@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State, project_with_jacobian
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
+from morph_dslam.tracking.reprojection import project_with_jacobian
 
 Array = NDArray[np.float64]
 #: More than this, pixels, and more than half of the residuals' variance, counts as the model's failure.
