@@ -12,6 +12,8 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.model.unknown_loads import with_unknown_loads
+from morph_dslam.registration.landmarks import shape_starts
+from morph_dslam.tracking.anchoring import points_on_object
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import PoseHypothesis
@@ -83,3 +85,21 @@ def test_the_load_of_the_study_is_found_where_unknown_loads_have_taken_over(pull
     # What is right stays.
     right = PoseHypothesis(found, every, measured, ones, known)
     assert estimation.search_other_shapes(right) is right
+
+
+def test_shapes_to_start_from_are_the_study_s_without_unknown_loads(pulled):
+    model, _, _ = pulled
+    shapes = np.array(shape_starts(model))
+    assert shapes.shape == (1 + 3**2, 2 + 25)
+    assert not shapes[:, 2:].any()
+    np.testing.assert_allclose(shapes[1:, 0].max(), 4.0 / 3.0)
+
+
+def test_no_map_point_that_an_unknown_load_may_move_holds_the_camera(pulled):
+    """Points of the top near its edge, which the study's load moves little, and of the bottom, which is held."""
+    model, _, _ = pulled
+    where = np.array([[0.002, 0.002, 0.02], [0.03, 0.03, 0.02], [0.03, 0.03, 0.0]])
+    place = SimpleNamespace(world_from_object=RigidTransform(np.eye(3), np.zeros(3)))
+    on_object, movable = points_on_object(where, place, model)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(on_object, [True, True, True])
+    np.testing.assert_array_equal(movable, [True, True, False])

@@ -284,8 +284,11 @@ def shape_starts(model: ReducedModel, largest: int = 243) -> list[Array]:
     """Parameters (d,) to start from: the default, then a coarse grid over the box.
 
     Each range is cut at 1/6, 1/2 and 5/6; when that makes more than ``largest`` shapes, one parameter at a
-    time leaves its default.
+    time leaves its default. Unknown loads are zero in all of them.
     """
+    if model.n_loads:
+        none = np.zeros(model.n_loads)
+        return [np.concatenate([shape, none]) for shape in shape_starts(model.without_loads, largest)]
     shares = (1 / 6, 1 / 2, 5 / 6)
     lower, upper, default = model.lower, model.upper, model.default
     d = len(lower)

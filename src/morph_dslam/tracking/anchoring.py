@@ -51,7 +51,9 @@ def points_on_object(
     size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
     field = model.restrict(samples)
     reach, undeformed = np.zeros(len(samples)), field.value(model.default)
-    for shape in shape_starts(model):
+    # Each unknown load may move points too, though searches for a shape leave all of them out.
+    loaded = [model.default + row for row in np.diag(model.upper - model.default)[len(model.study_parameters) :]]
+    for shape in (*shape_starts(model), *loaded):
         reach = np.maximum(reach, np.linalg.norm(field.value(shape) - undeformed, axis=1))
     in_object = place.world_from_object.inverse.apply(positions)
     distances, nearest = KDTree(model.rest_positions(samples)).query(in_object)

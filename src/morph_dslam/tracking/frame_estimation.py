@@ -61,7 +61,7 @@ class ShapeSearch:
     a bound are for an estimate that ran into it because of an unobservable parameter. A lever that is turned
     to the left looks as if it were turned by less than nothing, as long as its side is taken to be the right
     one: the estimate ends at the bound, where its side has no effect and so cannot be corrected. From a start
-    that is turned a little, with another side, it can. Shapes are those of the study: unknown loads start at zero.
+    that is turned a little, with another side, it can. Unknown loads start at zero.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class ShapeSearch:
     """
 
     def __init__(self, model: ReducedModel, count: int) -> None:
-        shapes = _study_shapes(model)
+        shapes = np.array(shape_starts(model))
         order = np.random.default_rng(0).permutation(len(shapes) - 1) + 1
         self._model, self._shapes, self._count = model, shapes[np.concatenate([[0], order])], count
         self._next, self._random = 0, np.random.default_rng(0)
@@ -102,14 +102,6 @@ class ShapeSearch:
         drawn = model.lower + self._random.random((self._count, len(width))) * width
         drawn[:, d:] = model.default[d:]
         return [replace(state, parameters=np.where(free, row, inside)) for row in drawn]
-
-
-def _study_shapes(model: ReducedModel) -> Array:
-    """Parameters (k, d) to start from, spread over the box of the study's; unknown loads are zero."""
-    if model.energy is None:
-        return np.array(shape_starts(model))
-    own = np.array(shape_starts(model.energy.model))
-    return np.hstack([own, np.zeros((len(own), model.n_loads))])
 
 
 def with_unobservable_at_default(model: ReducedModel, estimate: Estimate) -> State:
