@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.model.parameter_errors import ParameterErrors, equivalent_errors, parameter_errors
-from morph_dslam.tracking.frame_results import with_discretisation
+from morph_dslam.model.model_errors import ModelErrors
+from morph_dslam.model.parameter_errors import equivalent_errors, parameter_errors
+from morph_dslam.tracking.frame_results import with_model_errors
+from morph_dslam.tracking.observability import covariance_of_parameters
 from tests.support.streamed import tracked_result
 from tests.support.stretched_block import SIZE, stretched_block_model
 
@@ -38,7 +40,9 @@ def test_what_parameters_explain_of_an_error_is_found_and_the_rest_is_not(model)
     error = displacement(model, MEANT[0]) - displacement(model, STATES[0])
     # Motion along y is orthogonal to all that the parameters do.
     error[:, 1] += 1e-4
-    assert equivalent_errors(model, STATES[0], error) == pytest.approx(MEANT[0] - STATES[0], rel=1e-9)
+    changes, left = equivalent_errors(model, STATES[0], error)
+    assert changes == pytest.approx(MEANT[0] - STATES[0], rel=1e-9)
+    assert left == pytest.approx(1e-4, rel=1e-9)
 
 
 def test_the_certificate_has_them_by_name_with_the_size_of_the_displacement(model, certified):
@@ -52,8 +56,9 @@ def test_the_certificate_has_them_by_name_with_the_size_of_the_displacement(mode
 def test_deviations_hold_them_in_proportion_to_the_displacement(model, certified):
     stretch, slide = 0.06, 0.004
     plain = tracked_result(model, stretch, slide)
-    assert with_discretisation(plain, ParameterErrors.of(model)) is plain
-    found = with_discretisation(plain, ParameterErrors.of(certified))
+    assert ModelErrors.of(model) is None
+    assert with_model_errors(plain, None) is plain
+    found = with_model_errors(plain, ModelErrors.of(certified))
 
     def size(mu):
         return np.sqrt(np.mean(np.sum(displacement(model, mu) ** 2, axis=1)))
@@ -62,15 +67,34 @@ def test_deviations_hold_them_in_proportion_to_the_displacement(model, certified
     expected = plain.covariance.copy()
     expected[:2, :2] += errors.T @ errors / 2.0
     assert found.covariance == pytest.approx(expected, rel=1e-9)
-    at_rest = with_discretisation(tracked_result(model, 0.0, 0.0), ParameterErrors.of(certified))
+    # The images fix the shape: its deviation and what is observable stay as they were.
+    assert found.displacement_std() == pytest.approx(plain.displacement_std(), rel=1e-6)
+    assert found.estimate is not None
+    assert covariance_of_parameters(found.estimate) == pytest.approx(plain.covariance[:2, :2], rel=1e-9)
+    at_rest = with_model_errors(tracked_result(model, 0.0, 0.0), ModelErrors.of(certified))
     assert at_rest.covariance == pytest.approx(plain.covariance, rel=1e-9)
+
+
+def test_what_parameters_cannot_make_good_is_a_deviation_of_the_displacement(model):
+    """Finer elements that also bulge along y by a twentieth of the displacement's size."""
+    finer = displacement(model, STATES[1])
+    size = np.sqrt(np.mean(np.sum(finer[np.unique(model.triangles)] ** 2, axis=1)))
+    finer[:, 1] += 0.05 * size
+    entry = parameter_errors(model, [(STATES[1], displacement(model, STATES[1]), finer)])
+    known = replace(model, certificate={"discretisation": {"parameters": entry}})
+    plain = tracked_result(model, *STATES[1])
+    found = with_model_errors(plain, ModelErrors.of(known))
+    share = 0.05 / np.sqrt(1.0 + 0.05**2)
+    assert found.displacement_std() == pytest.approx(np.hypot(plain.displacement_std(), share * size), rel=1e-6)
+    assert found.covariance == pytest.approx(plain.covariance, rel=1e-9)
 
 
 def test_a_known_parameter_gets_no_deviation(model, certified):
     plain = tracked_result(model, 0.06, 0.004)
     covariance = plain.covariance.copy()
     covariance[1, :] = covariance[:, 1] = 0.0
+    assert plain.estimate is not None
     known = replace(plain, estimate=replace(plain.estimate, covariance=covariance))
-    found = with_discretisation(known, ParameterErrors.of(certified)).covariance
+    found = with_model_errors(known, ModelErrors.of(certified)).covariance
     assert found[0, 0] > covariance[0, 0]
     assert not found[1].any()

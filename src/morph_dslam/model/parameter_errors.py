@@ -19,25 +19,31 @@ from morph_dslam.model.reduced_model import ReducedModel
 
 Array = NDArray[np.float64]
 #: The certificate's entries of these errors, within that of the discretisation.
-ENTRY, ERRORS, SIZES = "parameters", "errors", "displacement_rms_mm"
+ENTRY, ERRORS, SIZES, LEFT = "parameters", "errors", "displacement_rms_mm", "left_rms_mm"
 #: Combinations of parameters that move the surface by less than this part of what others do are left out.
 LEAST_EFFECT = 1e-3
 
 
-def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> Array:
-    """Parameters' changes (d,), SI, that move the surface most nearly as an error of the displacement does.
+def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> tuple[Array, float]:
+    """Parameters' changes that move the surface most nearly as an error of the displacement does, and what is left.
 
     Parameters
     ----------
     model : whose sensitivities are taken.
     mu : (d,) the state, SI.
     error : (n, 3) true displacement minus the model's, at the nodes, metres.
+
+    Returns
+    -------
+    changes : (d,), SI.
+    left : of the error on the surface, root mean square length, metres.
     """
     nodes, ranges = np.unique(model.triangles), np.array([p.upper - p.lower for p in model.parameters])
     _, slopes = model.fields["displacement"].value_and_sensitivities(mu)
     effects = slopes[:, nodes].reshape(len(ranges), -1).T * ranges
     changes = np.linalg.lstsq(effects, error[nodes].ravel(), rcond=LEAST_EFFECT)[0]
-    return np.asarray(ranges * changes, dtype=np.float64)
+    left = error[nodes] - (effects @ changes).reshape(-1, 3)
+    return np.asarray(ranges * changes, dtype=np.float64), _rms(left)
 
 
 def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, Array]]) -> dict[str, Any]:
@@ -52,12 +58,18 @@ def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, A
     Returns
     -------
     dict
-        "errors", by parameter, of each state, SI; "displacement_rms_mm" of the surface there.
+        "errors", by parameter, of each state, SI; "displacement_rms_mm" of the surface there; "left_rms_mm" of the
+        displacement's error that no change of the parameters makes good.
     """
     nodes = np.unique(model.triangles)
-    found = np.array([equivalent_errors(model, mu, finer - own) for mu, own, finer in states])
-    sizes = [1e3 * _rms(finer[nodes]) for _, _, finer in states]
-    return {ERRORS: {p.name: found[:, k].tolist() for k, p in enumerate(model.parameters)}, SIZES: sizes}
+    matched = [equivalent_errors(model, mu, finer - own) for mu, own, finer in states]
+    found = np.array([changes for changes, _ in matched])
+    errors = {parameter.name: found[:, k].tolist() for k, parameter in enumerate(model.parameters)}
+    return {
+        ERRORS: errors,
+        SIZES: [1e3 * _rms(finer[nodes]) for _, _, finer in states],
+        LEFT: [1e3 * left for _, left in matched],
+    }
 
 
 def _rms(displacement: Array) -> float:
@@ -72,11 +84,13 @@ class ParameterErrors:
     Attributes
     ----------
     per_metre : (k, d) errors at the states solved again, SI, over the root mean square displacement there.
+    left_share : of that displacement, root mean square over the states: what no change of the parameters makes good.
     functions : of the displacement.
     products : (m, m) mean products of its modes on the surface, squared metres.
     """
 
     per_metre: Array
+    left_share: float
     functions: Functions
     products: Array
 
@@ -87,16 +101,25 @@ class ParameterErrors:
         if stated is None or not model.parameters:
             return None
         sizes, none = 1e-3 * np.array(stated[SIZES]), [0.0] * len(stated[SIZES])
+        left = 1e-3 * np.array(stated.get(LEFT, none))
         errors = np.array([stated[ERRORS].get(p.name, none) for p in model.parameters]).T
         moved = sizes > 0.0
         if not moved.any():
             return None
         nodes, field = np.unique(model.triangles), model.fields["displacement"]
         modes = field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
-        return cls(errors[moved] / sizes[moved, None], field.functions, modes @ modes.T / len(nodes))
+        share = float(np.sqrt(np.mean((left[moved] / sizes[moved]) ** 2)))
+        return cls(errors[moved] / sizes[moved, None], share, field.functions, modes @ modes.T / len(nodes))
 
     def covariance(self, mu: Array) -> Array:
         """Covariance (d, d) of the parameters at a state ``mu`` (d,), SI."""
+        return np.asarray(self._squared(mu) * self.per_metre.T @ self.per_metre / len(self.per_metre))
+
+    def left(self, mu: Array) -> float:
+        """Error of the displacement at a state ``mu`` (d,), SI, that parameters cannot make good, metres."""
+        return self.left_share * float(np.sqrt(self._squared(mu)))
+
+    def _squared(self, mu: Array) -> float:
+        """Mean square displacement of the surface, squared metres."""
         row = self.functions.rows(self.functions.nearest_inside(mu))[0]
-        size = max(float(row @ self.products @ row), 0.0)
-        return np.asarray(size * self.per_metre.T @ self.per_metre / len(self.per_metre))
+        return max(float(row @ self.products @ row), 0.0)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import von_mises
+from morph_dslam.model.reduction_errors import HELD_OUT, ON_MODES, errors_on_modes
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
@@ -176,8 +177,14 @@ class _ErrorTally:
         return {f"{name}{ending}": float(value) / unit for name, value in absolute.items()} | self.relative()
 
 
-def certify(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:
+def certify(model: ReducedModel, held_out: list[Snapshot], scattered: bool = True) -> dict[str, Any]:
     """Errors of every field of a model over held-out solves, in plain JSON types.
+
+    Parameters
+    ----------
+    model : whose errors they are.
+    held_out : solves that it was not made from.
+    scattered : whether their parameters are uniform in the box, as the statement on the whole box needs.
 
     Returns
     -------
@@ -186,14 +193,15 @@ def certify(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:
         "largest" (true value), keys ending in the unit; "relative_l2"; "mean_relative_to_largest". A stress
         has the same under "von_mises". The displacement has besides "mean_mm_by_modes", with the first 1, 2,
         ... modes only; "worst_sample", coordinates (SI) where its mean error is largest; "n_held_out";
-        "confidence". "sensitivity" holds the two relative measures of the displacement's derivative by each
-        parameter, and is absent where the solver gave none. "held_out" holds coordinates (SI), mean and
-        largest displacement error of each solve.
+        "confidence", where they are scattered. "sensitivity" holds the two relative measures of the
+        displacement's derivative by each parameter, and is absent where the solver gave none. "held_out" holds
+        coordinates (SI), mean and largest displacement error of each solve, and this error's products with the
+        modes (`errors_on_modes`).
     """
     certificate: dict[str, Any] = {}
     for name, field in model.fields.items():
         if name == "displacement":
-            certificate |= _displacement_errors(model, held_out)
+            certificate |= _displacement_errors(model, held_out, scattered)
         else:
             certificate[name] = field_errors(name, _pairs(field, name, held_out))
     if all("displacement" in snapshot.sensitivities for snapshot in held_out):
@@ -260,7 +268,7 @@ def field_errors(name: str, pairs: Iterable[tuple[Array, Array]]) -> dict[str, A
     return figures.pop(name) | figures
 
 
-def _displacement_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:
+def _displacement_errors(model: ReducedModel, held_out: list[Snapshot], scattered: bool) -> dict[str, Any]:
     """The entries "displacement" and "held_out"."""
     field, name = model.displacement, "displacement"
     tally = _tally(field, name, held_out)
@@ -269,14 +277,16 @@ def _displacement_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[
         "mean_mm_by_modes": (1e3 * errors_by_modes(field, name, held_out)).tolist(),
         "worst_sample": coordinates[int(tally.sample_means.argmax())],
         "n_held_out": len(held_out),
-        "confidence": confidence_statement(len(held_out)),
     }
+    if scattered:
+        figures["confidence"] = confidence_statement(len(held_out))
     samples = {
         "coordinates": coordinates,
         "mean_mm": (1e3 * tally.sample_means).tolist(),
         "max_mm": (1e3 * tally.sample_maxima).tolist(),
+        ON_MODES: errors_on_modes(model, (truth - found for found, truth in _pairs(field, name, held_out))),
     }
-    return {name: figures, "held_out": samples}
+    return {name: figures, HELD_OUT: samples}
 
 
 def _sensitivity_errors(model: ReducedModel, held_out: list[Snapshot]) -> dict[str, Any]:

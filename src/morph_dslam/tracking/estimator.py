@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.model_errors import ModelDeviation
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, huber_covariance
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
@@ -152,6 +153,7 @@ class Estimate:
     measured_covariance : the covariance without any prior on the parameters; None where there was none.
     stated_covariance : the covariance before the residuals widen it, by what they show that model and reference are off
         by; None where they do not.
+    by_model : what the model's own errors have added to the covariance; None where they have not.
     """
 
     state: State
@@ -164,6 +166,21 @@ class Estimate:
     converged: bool
     measured_covariance: Array | None = None
     stated_covariance: Array | None = None
+    by_model: ModelDeviation | None = None
+
+    @property
+    def image_covariance(self) -> Array:
+        """The covariance (d + 6, d + 6) without what the model's own errors have added: that of shape and pose."""
+        if self.by_model is None:
+            return self.covariance
+        d, covariance = len(self.state.parameters), self.covariance.copy()
+        covariance[:d, :d] -= self.by_model.parameters
+        return covariance
+
+    @property
+    def model_displacement(self) -> float:
+        """What the model's own errors add to the displacement, root mean square length, metres."""
+        return 0.0 if self.by_model is None else self.by_model.displacement
 
     @property
     def parameter_std(self) -> Array:

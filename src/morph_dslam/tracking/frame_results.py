@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.hypothesis import PoseHypothesis
@@ -115,19 +115,21 @@ def _with_systematic_errors(
     return estimate, left.px, warnings
 
 
-def with_discretisation(result: FrameResult, errors: ParameterErrors | None) -> FrameResult:
-    """The result with the error of the model's mesh in the deviations of its parameters.
+def with_model_errors(result: FrameResult, errors: ModelErrors | None) -> FrameResult:
+    """The result with the errors of the model's mesh and of its reduction in its deviations.
 
-    It is the same in frames alike, so that it weighs no frame against another: only results have it. Known parameters
-    do not get one.
+    They are the same in frames alike, so that they weigh no frame against another: only results have them. Known
+    parameters do not get any.
     """
     estimate = result.estimate
     if errors is None or estimate is None:
         return result
-    d, covariance = len(estimate.state.parameters), estimate.covariance.copy()
+    mu, covariance = estimate.state.parameters, estimate.covariance.copy()
+    d, by_model = len(mu), errors.at(mu)
     sought = np.diag(covariance)[:d] > 0.0
-    covariance[:d, :d] += np.outer(sought, sought) * errors.covariance(estimate.state.parameters)
-    return replace(result, estimate=replace(estimate, covariance=covariance))
+    by_model = replace(by_model, parameters=np.outer(sought, sought) * by_model.parameters)
+    covariance[:d, :d] += by_model.parameters
+    return replace(result, estimate=replace(estimate, covariance=covariance, by_model=by_model))
 
 
 def pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:

@@ -18,14 +18,14 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
 from morph_dslam.tracking.frame_estimation import new_filter
-from morph_dslam.tracking.frame_results import with_discretisation
+from morph_dslam.tracking.frame_results import with_model_errors
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.measurement import PATCH_WINDOW
@@ -341,7 +341,8 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
-        self._errors, self._mesh_errors = RigErrors(self.trackers, self.cameras), ParameterErrors.of(self.model)
+        self._errors = RigErrors(self.trackers, self.cameras)
+        self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._sigma_px = FIRST_SIGMA_PX
 
     @property
@@ -428,7 +429,7 @@ class RigTracker:
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
         )
-        return with_discretisation(found, self._mesh_errors)
+        return with_model_errors(found, self._model_errors)
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""

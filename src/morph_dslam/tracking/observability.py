@@ -18,6 +18,7 @@ from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
 #: A standard deviation of this share of a parameter's range makes the 95 % interval as wide as the range.
@@ -79,7 +80,7 @@ def covariance_of_parameters(estimate: Estimate) -> Array:
     """(d, d), from the images and what is known of the pose, without a prior on the parameters."""
     d = len(estimate.state.parameters)
     measured = estimate.measured_covariance
-    return (estimate.covariance if measured is None else measured)[:d, :d]
+    return (estimate.image_covariance if measured is None else measured)[:d, :d]
 
 
 def unobservable_in_run(
@@ -157,7 +158,8 @@ def displacement_std(model: ReducedModel, estimate: Estimate) -> Array:
     uncertainty is not in it.
     """
     _, slopes = model.displacement.value_and_sensitivities(estimate.state.parameters)
-    return np.sqrt(_variances(slopes, estimate).sum(axis=1))
+    variances = _variances(slopes, estimate.image_covariance).sum(axis=1)
+    return np.sqrt(variances + estimate.model_displacement**2)
 
 
 def position_std(model: ReducedModel, estimate: Estimate) -> Array:
@@ -173,8 +175,8 @@ def position_std(model: ReducedModel, estimate: Estimate) -> Array:
     jacobian[:, :, :d] = np.moveaxis(slopes @ rotation.T, 0, 2)
     jacobian[:, :, d : d + 3] = -cross_matrix(turned)
     jacobian[:, :, d + 3 :] = np.eye(3)
-    variances = np.einsum("nij,jk,nik->n", jacobian, estimate.covariance, jacobian, optimize=True)
-    return np.sqrt(np.maximum(variances, 0.0))
+    variances = np.einsum("nij,jk,nik->n", jacobian, estimate.image_covariance, jacobian, optimize=True)
+    return np.sqrt(np.maximum(variances, 0.0) + estimate.model_displacement**2)
 
 
 def von_mises_std(model: ReducedModel, estimate: Estimate, place: str) -> Array:
@@ -184,7 +186,7 @@ def von_mises_std(model: ReducedModel, estimate: Estimate, place: str) -> Array:
     turned = stress @ form
     size = np.sqrt(np.einsum("nc,nc->n", turned, stress))
     along = np.einsum("nc,dnc->dn", turned, slopes) / np.where(size > 0.0, size, 1.0)
-    return np.sqrt(_variances(along[:, :, None], estimate)[:, 0])
+    return np.sqrt(_variances(along[:, :, None], estimate.covariance)[:, 0])
 
 
 def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
@@ -193,7 +195,9 @@ def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float
     length = np.linalg.norm(value, axis=1)
     node = int(length.argmax())
     direction = value[node] / max(float(length[node]), 1e-300)
-    return float(length[node]), _deviation(model.displacement, node, direction, estimate)
+    deviation = _deviation(model.displacement, node, direction, estimate.state, estimate.image_covariance)
+    # In one direction of three.
+    return float(length[node]), float(np.hypot(deviation, estimate.model_displacement / np.sqrt(3.0)))
 
 
 def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
@@ -206,19 +210,19 @@ def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, f
         if not sizes[node] <= found[0]:
             form = _PLANE if stress.shape[1] == 3 else _SOLID
             direction = form @ stress[node] / max(float(sizes[node]), 1e-300)
-            found = float(sizes[node]), _deviation(model.stresses[place], node, direction, estimate)
+            deviation = _deviation(model.stresses[place], node, direction, estimate.state, estimate.covariance)
+            found = float(sizes[node]), deviation
     return found
 
 
-def _deviation(field: SeparatedField, node: int, direction: Array, estimate: Estimate) -> float:
+def _deviation(field: SeparatedField, node: int, direction: Array, state: State, covariance: Array) -> float:
     """Standard deviation of a field's component along a direction (c,), at one of its points."""
     there = field.with_modes(field.modes[:, [node]])
-    along = there.value_and_sensitivities(estimate.state.parameters)[1][:, 0] @ direction
-    return float(np.sqrt(_variances(along[:, None, None], estimate)[0, 0]))
+    along = there.value_and_sensitivities(state.parameters)[1][:, 0] @ direction
+    return float(np.sqrt(_variances(along[:, None, None], covariance)[0, 0]))
 
 
-def _variances(slopes: Array, estimate: Estimate) -> Array:
-    """Variances (n, c) of what has the derivatives (d, n, c) by the parameters."""
+def _variances(slopes: Array, covariance: Array) -> Array:
+    """Variances (n, c) of what has the derivatives (d, n, c) by the parameters, of a covariance (d + 6, d + 6)."""
     d = len(slopes)
-    covariance = estimate.covariance[:d, :d]
-    return np.maximum(np.einsum("dnc,de,enc->nc", slopes, covariance, slopes, optimize=True), 0.0)
+    return np.maximum(np.einsum("dnc,de,enc->nc", slopes, covariance[:d, :d], slopes, optimize=True), 0.0)

@@ -142,6 +142,11 @@ class FrameResult:
         return np.full((len(self.model.parameters) + 6,) * 2, np.nan)
 
     @property
+    def image_covariance(self) -> Array:
+        """The same without the errors of the model's mesh and reduction, which make parameters wrong, but no shapes."""
+        return self.covariance if self.estimate is None else self.estimate.image_covariance
+
+    @property
     def pose(self) -> RigidTransform | None:
         """camera_from_object, metres; None when lost."""
         if self.estimate is not None:

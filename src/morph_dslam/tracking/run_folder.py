@@ -342,9 +342,8 @@ def centre_and_std(
     """Centre of a structure (3,) in the camera frame and its standard deviations (3,), metres.
 
     With c = R p(mu) + t and the pose's increment on the left, the derivatives by parameters, rotation vector
-    and translation are R dp/dmu, -[R p]x and 1; the covariance is carried through them to first order. It
-    is that of the images' noise: it holds neither the model's error nor that of the registration. The centre
-    is moved by ``discrepancy`` too.
+    and translation are R dp/dmu, -[R p]x and 1; the covariance is carried through them to first order. What the
+    model's own errors add to displacements is added. The centre is moved by ``discrepancy`` too.
     """
     state = estimate.state
     centre, sensitivities = structure.centre_and_sensitivities(state.parameters)
@@ -355,8 +354,9 @@ def centre_and_std(
     jacobian = np.hstack([rotation @ sensitivities.T, -cross_matrix(arm), np.eye(3)])
     if not np.isfinite(estimate.covariance).all():
         return arm + state.camera_from_object.translation, np.full(3, np.inf)
-    variance = np.einsum("xi,ij,xj->x", jacobian, estimate.covariance, jacobian)
-    return arm + state.camera_from_object.translation, np.sqrt(np.maximum(variance, 0.0))
+    variance = np.maximum(np.einsum("xi,ij,xj->x", jacobian, estimate.image_covariance, jacobian), 0.0)
+    deviation = np.sqrt(variance + estimate.model_displacement**2 / 3.0)
+    return arm + state.camera_from_object.translation, deviation
 
 
 def write_inner_positions(path: Path, run: RunResults, structures: Sequence[CarriedStructure]) -> None:

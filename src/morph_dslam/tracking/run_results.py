@@ -140,10 +140,11 @@ class RunResults:
         if result.discrepancy is not None:
             values = values + result.discrepancy.displacement(self.points.rest)
         d = len(slopes)
-        covariance = result.estimate.covariance[:d, :d]
+        covariance = result.estimate.image_covariance[:d, :d]
         if not np.isfinite(covariance).all():
             return [VectorEstimate.of(value, np.full((3, 3), np.inf)) for value in values]
         of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
+        of_points += result.estimate.model_displacement**2 / 3.0 * np.eye(3)
         return [VectorEstimate.of(value, of_point) for value, of_point in zip(values, of_points, strict=True)]
 
     @cached_property

@@ -7,8 +7,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
@@ -24,6 +26,7 @@ from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
 from morph_dslam.tracking.still_notices import still_notices
 from morph_dslam.tracking.tracker import Tracker
 
+Array = NDArray[np.float64]
 #: Live, the pose is estimated anew after so many frames, and whenever there are twice as many.
 FIRST_TIME = 10
 #: Frames that are kept for it; then every second one is dropped.
@@ -51,7 +54,7 @@ def with_still_pose(
     assert isinstance(tracker, Tracker)
     names = [parameter.name for parameter in part.model.parameters]
     constant = [names.index(name) for name in part.options.per_sequence]
-    known = _state_term(part) if estimated else known_state(part)
+    known = _state_term(part, _covariance_of(part)) if estimated else known_state(part)
     problem = StillProblem(
         part.model,
         part.camera,
@@ -83,17 +86,35 @@ def known_state(part: PlacedObject) -> LandmarkTerm | StateTerm:
     """What an object's registration rests on: its landmarks, or what these and other measurements gave together."""
     landmarks, registration = part.object.start, part.registration
     if not isinstance(landmarks, Landmarks) or registration.facts.get("corrected_by_outline", False):
-        return _state_term(part)
+        return _state_term(part, _covariance_of_first_frame(part))
     sigma = landmark_deviation(registration.facts["sigma_px"])
     return LandmarkTerm(bind_landmarks(part.model, landmarks.points), landmarks.pixels, sigma)
 
 
-def _state_term(part: PlacedObject) -> StateTerm:
+def _state_term(part: PlacedObject, covariance: Array) -> StateTerm:
     """The registration's state, as well as it is known."""
-    scale, covariance = Box.of(part.model).scale, part.registration.covariance
+    return StateTerm(part.registration.state, covariance, Box.of(part.model).scale)
+
+
+def _covariance_of(part: PlacedObject) -> Array:
+    """That of the registration (d + 6, d + 6), SI; wide where it has none."""
+    covariance = part.registration.covariance
     if covariance is None or not np.isfinite(covariance).all():
-        covariance = np.diag(scale**2)
-    return StateTerm(part.registration.state, covariance, scale)
+        return np.diag(Box.of(part.model).scale ** 2)
+    return covariance
+
+
+def _covariance_of_first_frame(part: PlacedObject) -> Array:
+    """The same with what the model's own errors do to one frame; nothing at rest shows a per-sequence parameter."""
+    parameters, covariance = part.registration.state.parameters, _covariance_of(part).copy()
+    d, errors = len(parameters), ModelErrors.of(part.model)
+    if part.object.at_rest:
+        unknown = [k for k, p in enumerate(part.model.parameters) if p.name in part.options.per_sequence]
+        covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+        covariance[unknown, unknown] = Box.of(part.model).scale[unknown] ** 2
+    elif errors is not None:
+        covariance[:d, :d] += errors.at(parameters).parameters
+    return covariance
 
 
 class OpenedSurface(Reregistration):

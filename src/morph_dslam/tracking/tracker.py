@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
@@ -32,7 +32,7 @@ from morph_dslam.tracking.frame_estimation import (
     new_filter,
     with_unobservable_at_default,
 )
-from morph_dslam.tracking.frame_results import lost_result, pose_source, tracked_result, with_discretisation
+from morph_dslam.tracking.frame_results import lost_result, pose_source, tracked_result, with_model_errors
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
@@ -146,7 +146,7 @@ class Tracker:
         self.camera, self.options, self.anchor = camera, options or TrackerOptions(), anchor
         check_pose(self.options, registration, in_map=anchor is not None or keyframes is not None)
         self.estimator = Estimator(self.model, camera, self.options.estimation)
-        self._mesh_errors = ParameterErrors.of(self.model)
+        self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
         use, sought = self.options.use_discrepancy, self.options.discrepancy
@@ -202,7 +202,7 @@ class Tracker:
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
             change = self._choose_view(image, hypothesis, result)
-            result = with_discretisation(result, self._mesh_errors)
+            result = with_model_errors(result, self._model_errors)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)

@@ -1,0 +1,72 @@
+"""What a model itself adds to the deviations of a frame's estimate: by its mesh and by its reduction.
+
+Both are made good by the parameters, since the images fix the shape. So they widen the deviations of the parameters,
+and of the stresses and forces that follow from these. The displacement is off by what parameters cannot make good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.reduced_model import ReducedModel
+from morph_dslam.model.reduction_errors import ReductionErrors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelDeviation:
+    """What a model adds in one state.
+
+    Attributes
+    ----------
+    parameters : (d, d) to the parameters' covariance, SI.
+    displacement : to the displacement, root mean square length, metres.
+    """
+
+    parameters: Array
+    displacement: float
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """What a model adds in any state.
+
+    Attributes
+    ----------
+    mesh : by its discretisation, if that was estimated.
+    reduction : by its reduction, if that is known.
+    constant : (d,) which parameters are found from all frames together.
+    n_loads : unknown loads among the last parameters; they get nothing.
+    """
+
+    mesh: ParameterErrors | None
+    reduction: ReductionErrors | None
+    constant: NDArray[np.bool_]
+    n_loads: int
+
+    @classmethod
+    def of(cls, model: ReducedModel, constant: Collection[str] = ()) -> ModelErrors | None:
+        """Those of a model, of which parameters of these names are found from all frames together; None if unknown."""
+        mesh, reduction = ParameterErrors.of(model), ReductionErrors.of(model.without_loads)
+        if mesh is None and reduction is None:
+            return None
+        kept = np.array([parameter.name in constant for parameter in model.parameters], dtype=bool)
+        return cls(mesh, reduction, kept, model.n_loads)
+
+    def at(self, mu: Array) -> ModelDeviation:
+        """In the state ``mu`` (d,), SI."""
+        covariance, squared = np.zeros((len(mu), len(mu))), 0.0
+        if self.mesh is not None:
+            covariance += self.mesh.covariance(mu)
+            squared += self.mesh.left(mu) ** 2
+        if self.reduction is not None:
+            own = len(mu) - self.n_loads
+            covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own])
+            squared += self.reduction.size**2
+        return ModelDeviation(covariance, float(np.sqrt(squared)))

@@ -1,0 +1,117 @@
+"""What a model's reduction error amounts to in its parameters.
+
+A certificate has how far the displacement is off in held-out solutions. Where two parameters change the shape nearly
+alike, little of it is much of a parameter. As rigid motions are found by the pose, only the rest counts. An error that
+lies in the modes of the displacement is kept by its products with them: the derivatives by the parameters lie there
+too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.model.functions import Functions
+from morph_dslam.model.reduced_model import ReducedModel
+
+Array = NDArray[np.float64]
+#: The certificate's entry of the held-out solutions, and there that of the products of errors and modes.
+HELD_OUT, ON_MODES = "held_out", "error_on_modes_m2"
+
+
+def errors_on_modes(model: ReducedModel, errors: Iterable[Array]) -> list[list[float]]:
+    """Mean products (k, m), m2, of displacement errors (n, 3) at the nodes, metres, with the modes on the surface."""
+    modes, nodes = _surface_modes(model), np.unique(model.triangles)
+    return [(modes @ error[nodes].astype(np.float64).ravel() / len(nodes)).tolist() for error in errors]
+
+
+def _surface_modes(model: ReducedModel) -> Array:
+    """The displacement's modes (m, 3 s) at the surface's nodes, without rigid motions."""
+    nodes, field = np.unique(model.triangles), model.displacement
+    modes = field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
+    arms = model.nodes[nodes] - model.nodes[nodes].mean(axis=0)
+    rigid = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(nodes), 1)), np.cross(axis, arms))]
+    motions, _ = np.linalg.qr(np.reshape(rigid, (6, -1)).T)
+    return np.asarray(modes - (modes @ motions) @ motions.T)
+
+
+@dataclass(frozen=True)
+class ReductionErrors:
+    """Errors of estimated parameters by a model's reduction.
+
+    Attributes
+    ----------
+    states : (k, d) held-out, SI.
+    on_modes : (k, m) as of `errors_on_modes`.
+    size : of the displacement's error, root mean square, metres.
+    ranges : (d,) of the parameters.
+    functions : of the displacement.
+    products : (m, m) mean products of its modes on the surface, without rigid motions, squared metres.
+    """
+
+    states: Array
+    on_modes: Array
+    size: float
+    ranges: Array
+    functions: Functions
+    products: Array
+
+    @classmethod
+    def of(cls, model: ReducedModel) -> ReductionErrors | None:
+        """Those of a model; None where its certificate does not have them of this displacement."""
+        stated = model.certificate.get(HELD_OUT, {})
+        on_modes, states = np.array(stated.get(ON_MODES, ())), np.array(stated.get("coordinates", ()))
+        # With an angle about an axis of revolution, or unknown loads, a model has other modes than it was built with.
+        wanted = (len(states), model.displacement.n_modes), (len(on_modes), len(model.parameters))
+        if not len(states) or not len(model.parameters) or (on_modes.shape, states.shape) != wanted:
+            return None
+        modes = _surface_modes(model)
+        size = 1e-3 * float(np.sqrt(np.mean(np.square(stated["mean_mm"]))))
+        products = modes @ modes.T / len(np.unique(model.triangles))
+        return cls(states, on_modes, size, model.upper - model.lower, model.displacement.functions, products)
+
+    def covariance(self, mu: Array, constant: NDArray[np.bool_]) -> Array:
+        """Covariance (d, d) of the parameters at a state, SI.
+
+        Parameters
+        ----------
+        mu : (d,) the state, SI.
+        constant : (d,) which parameters are found from many states together. Their errors are those at the held-out
+            states, of which each counts by how well it shows the parameter.
+        """
+        effects = self._effects(mu)
+        free = np.flatnonzero(~constant)
+        inverse = self._inverse(effects[free])
+        found = np.zeros((len(mu), len(mu)))
+        errors = inverse @ effects[free] @ self.on_modes.T
+        found[np.ix_(free, free)] = errors @ errors.T / errors.shape[1]
+        # What a constant is off by, the others make good as far as they can.
+        taken = np.eye(len(mu))[:, constant]
+        taken[free] = -inverse @ effects[free] @ self.products @ effects[constant].T
+        found += taken * self._of_constants[constant] @ taken.T
+        return np.asarray(found * np.outer(self.ranges, self.ranges))
+
+    def _effects(self, mu: Array) -> Array:
+        """Derivatives (d, m) of the displacement's functions by the parameters, over their whole ranges."""
+        return self.functions.rows(self.functions.nearest_inside(mu))[1:] * self.ranges[:, None]
+
+    def _inverse(self, effects: Array) -> Array:
+        """Of the parameters' normal matrix (d, d); one that moves the surface by less than the error is unknown."""
+        normal = effects @ self.products @ effects.T
+        least = max(self.size**2, np.finfo(float).tiny)
+        return np.asarray(np.linalg.inv(normal + least * np.eye(len(normal))), dtype=np.float64)
+
+    @cached_property
+    def _of_constants(self) -> Array:
+        """Variances (d,) of parameters found from many states, over their ranges squared."""
+        totals, weights = np.zeros(len(self.ranges)), np.zeros(len(self.ranges))
+        for mu, on_modes in zip(self.states, self.on_modes, strict=True):
+            effects = self._effects(mu)
+            inverse = self._inverse(effects)
+            shown = 1.0 / np.diag(inverse)
+            totals, weights = totals + shown * (inverse @ effects @ on_modes) ** 2, weights + shown
+        return np.asarray(totals / weights, dtype=np.float64)

@@ -1,0 +1,93 @@
+"""What the reduction error amounts to in the parameters, on a block that is stretched and sheared evenly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.model.model_errors import ModelErrors
+from morph_dslam.model.reduction_errors import ReductionErrors, errors_on_modes
+from tests.support.stretched_block import SIZE, stretched_block_model
+
+#: Held-out states, SI, and the parameters' changes that are the model's error there.
+STATES = np.array([[0.05, 0.002], [-0.05, 0.004]])
+CHANGES = np.array([[2e-3, 1e-4], [1e-3, -2e-4]])
+NEITHER = np.zeros(2, dtype=bool)
+
+
+def displacement(model, mu):
+    """(n, 3) in closed form."""
+    x, z = model.nodes[:, 0], model.nodes[:, 2]
+    return np.column_stack([mu[0] * x + mu[1] * z / SIZE[2], np.zeros((len(x), 2))])
+
+
+def errors_of(model):
+    found = ReductionErrors.of(model)
+    assert found is not None
+    return found
+
+
+def certified(model, errors, mean_mm=1e-6):
+    held_out = {
+        "coordinates": STATES.tolist(),
+        "mean_mm": [mean_mm] * len(errors),
+        "error_on_modes_m2": errors_on_modes(model, errors),
+    }
+    return replace(model, certificate={"held_out": held_out})
+
+
+@pytest.fixture(scope="module")
+def model():
+    return stretched_block_model()
+
+
+def test_errors_that_parameters_explain_are_theirs_and_rigid_motions_are_the_pose_s(model):
+    turned = np.cross([0.0, 2e-3, 0.0], model.nodes) + np.array([1e-4, -2e-4, 3e-4])
+    errors = errors_of(certified(model, [displacement(model, change) + turned for change in CHANGES]))
+    expected = CHANGES.T @ CHANGES / len(CHANGES)
+    for state in ([0.02, 0.001], [-0.04, 0.005]):  # the derivatives of this block are the same everywhere
+        assert errors.covariance(np.array(state), NEITHER) == pytest.approx(expected, rel=1e-5, abs=1e-14)
+
+
+def test_what_a_constant_is_off_by_the_other_parameter_makes_good(model):
+    """The slide is found from many states; the stretch makes up for its error as least squares say."""
+    errors = errors_of(certified(model, [displacement(model, change) for change in CHANGES]))
+    found = errors.covariance(np.array([0.02, 0.001]), np.array([False, True]))
+    variance = np.mean(CHANGES[:, 1] ** 2)
+    assert found[1, 1] == pytest.approx(variance, rel=1e-5)
+    nodes = np.unique(model.triangles)
+    arms = model.nodes[nodes] - model.nodes[nodes].mean(axis=0)
+    rigid = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(nodes), 1)), np.cross(axis, arms))]
+    columns = np.array([np.ravel(part) for part in rigid]).T
+    by = [displacement(model, unit)[nodes].ravel() for unit in np.eye(2)]
+    stretch, slide = (part - columns @ np.linalg.lstsq(columns, part, rcond=None)[0] for part in by)
+    taken = -(stretch @ slide) / (stretch @ stretch)
+    assert found[0, 1] == pytest.approx(taken * variance, rel=1e-5, abs=1e-14)
+    alone = np.mean([(stretch @ (a * stretch + b * slide) / (stretch @ stretch)) ** 2 for a, b in CHANGES])
+    assert found[0, 0] == pytest.approx(alone + taken**2 * variance, rel=1e-5)
+
+
+def test_a_parameter_that_moves_the_surface_by_less_than_the_error_is_unknown_within_its_range(model):
+    """An error as large as the whole range of the slide moves the surface: its deviation stays below half the range."""
+    errors = [displacement(model, [0.0, 10.0]), displacement(model, [0.0, -10.0])]
+    found = errors_of(certified(model, errors, mean_mm=1e6)).covariance(np.array([0.0, 0.001]), NEITHER)
+    ranges = model.upper - model.lower
+    assert (np.sqrt(np.diag(found)) <= 0.5 * ranges).all()
+
+
+def test_the_displacement_is_off_by_the_certified_error(model):
+    known = certified(model, [displacement(model, change) for change in CHANGES], mean_mm=0.25)
+    errors = ModelErrors.of(known)
+    assert errors is not None
+    assert errors.at(np.array([0.02, 0.001])).displacement == pytest.approx(0.25e-3)
+    assert ModelErrors.of(model) is None
+
+
+def test_errors_of_other_modes_do_not_count(model):
+    """A model whose displacement was changed after its certificate was made."""
+    known = certified(model, [displacement(model, change) for change in CHANGES])
+    field = model.displacement
+    halves = replace(
+        known, displacement=field.with_modes(np.concatenate([0.5 * field.modes, 0.5 * field.modes], axis=0))
+    )
+    assert ReductionErrors.of(halves) is None
