@@ -23,7 +23,7 @@ from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
 from morph_dslam.model.reduced_model import REACTION, Parameter, ReducedModel
 from morph_dslam.model.separated import SeparatedField
-from morph_dslam.model.unknown_loads import ROOT, UnknownLoads
+from morph_dslam.model.unknown_loads import ROOT, SecondOrder, UnknownLoads
 from morph_dslam.units import FACTORS
 
 #: Ranges of functions may differ from the parameters' by this share of the range: rounding.
@@ -142,6 +142,9 @@ def _write_loads(group: h5py.Group, loads: UnknownLoads) -> None:
     group.create_dataset("resultants", data=loads.resultants)
     for name, field in loads.responses.items():
         write_field(group.create_group(f"responses/{quote(name, safe=_PLAIN)}"), field)
+    if loads.second_order is not None:
+        group.create_dataset("second_order/soft", data=loads.second_order.soft)
+        write_field(group.create_group("second_order/displacement"), loads.second_order.displacement)
 
 
 def _read_loads(file: h5py.File, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> UnknownLoads | None:
@@ -156,7 +159,13 @@ def _read_loads(file: h5py.File, lower: NDArray[np.float64], upper: NDArray[np.f
         read_array(group, "tractions", 3),
         read_array(group, "resultants", 2),
         {unquote(name): read_field(read_group(responses, name), lower, upper) for name in names(responses)},
+        _read_second_order(group, lower, upper) if "second_order" in group else None,
     )
+
+
+def _read_second_order(group: h5py.Group, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> SecondOrder:
+    second = read_group(group, "second_order")
+    return SecondOrder(read_array(second, "soft", 2), read_field(read_group(second, "displacement"), lower, upper))
 
 
 def _check_loads(loads: UnknownLoads, model: ReducedModel) -> None:
@@ -174,6 +183,11 @@ def _check_loads(loads: UnknownLoads, model: ReducedModel) -> None:
         known = model.fields.get(name)
         each = m * (m + 1) // 2 if name == ROOT else m * (3 if known is None else known.modes.shape[2])
         _check_field(f"{name} of unknown loads", field, n_points, (each,), model)
+    second = loads.second_order
+    if second is not None:
+        if second.soft.shape[1] != m or not np.isfinite(second.soft).all():
+            raise ValueError(f"{m} unknown loads have soft combinations of shape {second.soft.shape}")
+        _check_field("second order of unknown loads", second.displacement, n_nodes, (3 * second.n_pairs,), model)
 
 
 def _read_parameters(file: h5py.File) -> tuple[Parameter, ...]:

@@ -1,8 +1,10 @@
 """Unknown loads of a model: tractions on a surface that act beside the study's loads, with what they cause.
 
 A load is a combination of m tractions, whose coefficients q are unknown. Displacement, stress, strain and reactions
-change linearly with q about the parametric state; how they do is a field of the parameters. The elastic energy of the
-loads is q' C(mu) q / 2 with the compliance C, and tells what loads are likely: exp(-energy / work scale).
+change linearly with q about the parametric state; how they do is a field of the parameters. The displacement changes to
+second order along the few softest combinations: a slender body turns long before it strains, and a turn that is linear
+would make it longer. The elastic energy of the loads is q' C(mu) q / 2 with the compliance C, and tells what loads are
+likely: exp(-energy / work scale).
 """
 
 from __future__ import annotations
@@ -40,6 +42,26 @@ def packed_root(compliance: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class SecondOrder:
+    """What the softest combinations of loads do to second order.
+
+    Attributes
+    ----------
+    soft : (s, m) to their coefficients z from those of all loads.
+    displacement : 3 s (s + 1) / 2 components: what z_a z_b adds to the displacement for each pair a <= b, metres, row
+        by row, pairs running slowest.
+    """
+
+    soft: Array
+    displacement: SeparatedField
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs s (s + 1) / 2."""
+        return len(self.soft) * (len(self.soft) + 1) // 2
+
+
+@dataclass(frozen=True)
 class UnknownLoads:
     """The tractions, and what a unit of each does.
 
@@ -52,6 +74,7 @@ class UnknownLoads:
     resultants : (m, 6) force, N, and moment about the origin, N m, of a unit of each.
     responses : by the name of a model's field, c m components: each of the field's c for each load, loads
         running slowest; and the `ROOT` of the compliance, J, as its upper triangle.
+    second_order : of the displacement; None where it was not found, as with contact.
     """
 
     surface: str
@@ -60,6 +83,7 @@ class UnknownLoads:
     tractions: Array
     resultants: Array
     responses: dict[str, SeparatedField]
+    second_order: SecondOrder | None = None
 
     @property
     def count(self) -> int:
@@ -92,28 +116,54 @@ def _joined_rows(known, of_loads, coefficients):
     return result
 
 
+@njit(cache=True, nogil=True)
+def _pair_rows(of_pairs, soft, coefficients):
+    """Values and derivatives (1 + d + m, p r) of r functions times z_a z_b of each pair a <= b, z = soft q."""
+    rows, r = of_pairs.shape
+    s, m = soft.shape
+    z = soft @ coefficients
+    result, pair = np.zeros((rows + m, s * (s + 1) // 2 * r)), 0
+    for a in range(s):
+        for b in range(a, s):
+            for j in range(r):
+                column = pair * r + j
+                for i in range(rows):
+                    result[i, column] = z[a] * z[b] * of_pairs[i, j]
+                for k in range(m):
+                    result[rows + k, column] = (soft[a, k] * z[b] + z[a] * soft[b, k]) * of_pairs[0, j]
+            pair += 1
+    return result
+
+
 @dataclass(frozen=True)
 class LoadedFunctions(Functions):
     """Functions of the parameters, followed by those of the loads' responses times each coefficient.
+
+    Where the second order is known, those of its pairs follow.
 
     Attributes
     ----------
     known : functions of the d parameters.
     of_loads : r functions of them.
     count : m coefficients, which follow the parameters and have no ends.
+    second_order : of the loads, if any.
     """
 
     known: Functions
     of_loads: Functions
     count: int
+    second_order: SecondOrder | None = None
 
     @property
     def n_functions(self) -> int:
-        return self.known.n_functions + self.count * self.of_loads.n_functions
+        second = self.second_order
+        of_pairs = 0 if second is None else second.n_pairs * second.displacement.functions.n_functions
+        return self.known.n_functions + self.count * self.of_loads.n_functions + of_pairs
 
     @property
     def n_floats(self) -> int:
-        return self.known.n_floats + self.of_loads.n_floats
+        of_pairs = 0 if self.second_order is None else self.second_order.displacement.functions.n_floats
+        return self.known.n_floats + self.of_loads.n_floats + of_pairs
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -122,8 +172,12 @@ class LoadedFunctions(Functions):
         return np.concatenate([lower, -open_end]), np.concatenate([upper, open_end])
 
     def _compiled(self, mu: Array) -> Array:
-        d = self.known.dimension
-        return _joined_rows(self.known.rows(mu[:d]), self.of_loads.rows(mu[:d]), mu[d:])
+        d, second = self.known.dimension, self.second_order
+        rows = _joined_rows(self.known.rows(mu[:d]), self.of_loads.rows(mu[:d]), mu[d:])
+        if second is None:
+            return rows
+        of_pairs = second.displacement.functions.rows(mu[:d])
+        return np.hstack([rows, _pair_rows(of_pairs, second.soft, np.ascontiguousarray(mu[d:]))])
 
     def mixed(self, matrix: Array) -> Self:
         raise NotImplementedError("functions of loads stay as they are")
@@ -187,7 +241,11 @@ def with_unknown_loads(model: ReducedModel, work: float | None = None) -> Reduce
     lowest = 0.0 if loads.inward else -span
     added = [Parameter(f"load {k + 1}", "ratio", "1", lowest, span, 0.0, "unknown load") for k in range(loads.count)]
     fields = {
-        name: _joined(model.fields.get(name, _nothing(response, model)), response)
+        name: _joined(
+            model.fields.get(name, _nothing(response, model)),
+            response,
+            loads.second_order if name == "displacement" else None,
+        )
         for name, response in (loads.responses | _of_tractions(model, loads)).items()
         if name != ROOT
     }
@@ -246,11 +304,16 @@ def _nothing(response: SeparatedField, model: ReducedModel) -> SeparatedField:
     return SeparatedField(np.zeros((1, response.modes.shape[1], 3)), _constant(model))
 
 
-def _joined(field: SeparatedField, response: SeparatedField) -> SeparatedField:
+def _joined(field: SeparatedField, response: SeparatedField, second: SecondOrder | None) -> SeparatedField:
     """A field of the parameters with its response to each load."""
-    r, n, columns = response.modes.shape
-    c = field.modes.shape[2]
-    count = columns // c
-    by_load = np.moveaxis(response.modes.reshape(r, n, count, c), 2, 0).reshape(count * r, n, c)
-    functions = LoadedFunctions(field.functions, response.functions, count)
-    return SeparatedField(np.concatenate([field.modes, by_load]), functions)
+    parts = [field.modes, _one_by_one(response, field.modes.shape[2])]
+    if second is not None:
+        parts.append(_one_by_one(second.displacement, 3))
+    count = response.modes.shape[2] // field.modes.shape[2]
+    return SeparatedField(np.concatenate(parts), LoadedFunctions(field.functions, response.functions, count, second))
+
+
+def _one_by_one(stacked: SeparatedField, c: int) -> NDArray[np.floating]:
+    """Modes (k r, n, c) of each of k fields that are stacked as components: r modes (r, n, k c)."""
+    r, n, columns = stacked.modes.shape
+    return np.moveaxis(stacked.modes.reshape(r, n, columns // c, c), 2, 0).reshape(-1, n, c)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -13,7 +14,13 @@ from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.load_modes import LoadedSurface, Respond
 from morph_dslam.mechanics.solid import SolidProblem
-from morph_dslam.mechanics.solvers.continuation import PathError, advance, loaded_state, refuse_passage
+from morph_dslam.mechanics.solvers.continuation import (
+    SMALLEST_INCREMENT,
+    PathError,
+    advance,
+    loaded_state,
+    refuse_passage,
+)
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
 from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
@@ -22,6 +29,10 @@ from morph_dslam.studies.sections import UnknownLoadsSection
 Array = NDArray[np.float64]
 #: Each increment of time of a rest is so many times the one before.
 GROWTH = 1.2
+#: Second derivatives are differences of steps that move no node by more than this part of the body's extent.
+SECOND_STEP = 2e-3
+#: So many times the smallest increment of a path is made in smaller ones, to say how far a body can be followed.
+ROUNDS = 4
 #: Fields of a snapshot and what they are called when recovered.
 _FIELDS = {"displacement": "displacement", "stress_solid": "stress", "strain": "strain"}
 
@@ -125,14 +136,37 @@ def response_reactions(
     return outputs
 
 
-def follow(problem: SolidProblem, start: State, target: Array) -> State:
-    """Solve at ``target``, (d,) or (k, d) in turn, in increments from ``start``."""
+def follow(
+    problem: SolidProblem, start: State, target: Array, farthest: Callable[[State, Array], Array] | None = None
+) -> State:
+    """Solve at ``target``, (d,) or (k, d) in turn, in increments from ``start``.
+
+    Raises SolverError, which names the last parameters that converged; where not even the first increment did, those
+    (d,) that ``farthest`` finds on the way from the start to a target (d,).
+    """
     try:
         return advance(problem, start, target)[-1]
     except PathError as error:
-        last = problem.state_text(error.states[-1].mu)
+        mu = error.states[-1].mu
+        if farthest is not None and len(error.states) == 1 and error.passage is None:
+            mu = farthest(start, target)
         further = f": {error.passage}, however small the increments" if error.passage else ""
-        raise SolverError(f"no equilibrium found beyond {last}, where the last solution converged{further}") from error
+        raise SolverError(
+            f"no equilibrium found beyond {problem.state_text(mu)}, where the last solution converged{further}"
+        ) from error
+
+
+def farthest_solved(problem: SolidProblem, start: State, target: Array) -> Array:
+    """Parameters (d,) up to which increments lead that are smaller than those of a path to ``target`` (d,).
+
+    They are looked for where a path's first increment is too large, over the first `ROUNDS` of such increments.
+    """
+    for _ in range(ROUNDS):
+        try:
+            start = advance(problem, start, start.mu + SMALLEST_INCREMENT * (target - start.mu))[-1]
+        except PathError as error:
+            return error.states[-1].mu
+    return start.mu
 
 
 @dataclass(frozen=True)
@@ -165,6 +199,7 @@ class SolidSweep:
         self.problem = problem
         self._kept: tuple[Array, Linearisation] | None = None
         self._solved: Array | None = None
+        self._farthest: dict[tuple[bytes, bytes], Array] = {}
 
     def first_state(self) -> _SolidState:
         """Equilibrium at the parameters' defaults, all loads grown together."""
@@ -195,8 +230,17 @@ class SolidSweep:
             state = state or solve(self.problem, target, State(target, predicted))
             refuse_passage(self.problem, State(start.mu, start.dofs), state)
         except SolverError:
-            state = follow(self.problem, State(start.mu, start.dofs), target)
+            state = follow(self.problem, State(start.mu, start.dofs), target, self._found_farthest)
         return self._with_slopes(state)
+
+    def _found_farthest(self, start: State, target: Array) -> Array:
+        """`farthest_solved`, once in each direction of a single parameter: that takes as long as many solves."""
+        if len(target) > 1:
+            return start.mu
+        key = start.mu.tobytes(), np.sign(target - start.mu).tobytes()
+        if key not in self._farthest:
+            self._farthest[key] = farthest_solved(self.problem, start, target)
+        return self._farthest[key]
 
     def _tangent_at(self, mu: Array) -> Linearisation | None:
         """The tangent of a solution if it is still at hand."""
@@ -221,6 +265,25 @@ class SolidSweep:
         """See `unknown_loads.LoadableProblem`."""
         forces = self._tangent(state).apply(responses) - loads
         return solid_responses(self.problem, state.dofs, state.mu, responses, forces)
+
+    def second_order(self, state: _SolidState, responses: Array) -> Array | None:
+        """See `unknown_loads.LoadableProblem`."""
+        if self.problem.contact:  # a gap that closes has no second derivative
+            return None
+        pairs = [(a, b) for a in range(len(responses)) for b in range(a, len(responses))]
+        sums = [responses[a] if a == b else responses[a] + responses[b] for a, b in pairs]
+        bends = dict(zip(pairs, (self._curvature(state, one) for one in sums), strict=True))
+        # Along a sum of two, the second derivative has those along each, and twice the mixed one.
+        forces = [0.5 * bends[a, a] if a == b else 0.5 * (bends[a, b] - bends[a, a] - bends[b, b]) for a, b in pairs]
+        changes = -self._tangent(state).solve(np.array(forces))
+        return np.array([self.problem.nodal_displacement(change) for change in changes])
+
+    def _curvature(self, state: _SolidState, change: Array) -> Array:
+        """Second derivative (n,) of the residual along a change of the dofs (n,), by central differences."""
+        extent = float(np.linalg.norm(np.ptp(self.problem.mesh.nodes, axis=0)))
+        step = SECOND_STEP * extent / max(float(np.abs(self.problem.nodal_displacement(change)).max()), 1e-300)
+        at = [self.problem.residual(state.dofs + k * step * change, state.mu) for k in (-1.0, 0.0, 1.0)]
+        return (at[0] - 2.0 * at[1] + at[2]) / step**2
 
     def _tangent(self, state: _SolidState) -> Linearisation:
         return self._tangent_at(state.mu) or self.problem.linearise(state.dofs, state.mu)

@@ -2,14 +2,18 @@
 
 The softest tractions on a surface (`mechanics.load_modes`) are found in several states and joined to one set. In states
 spread over the parameters, the tangent then tells what each of them does: displacement, stress and reactions, which are
-reduced like other fields. So the loads act linearly about every parametric state.
+reduced like other fields. So the loads act linearly about every parametric state. The softest combinations of them move
+the body to second order too, by the second derivative of the equations along what they do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -25,7 +29,7 @@ from morph_dslam.mechanics.load_modes import (
 from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.model.functions import ParameterFunctions, total_degree_indices
 from morph_dslam.model.separated import SeparatedField
-from morph_dslam.model.unknown_loads import ROOT, UnknownLoads, packed_root
+from morph_dslam.model.unknown_loads import LEAST_COMPLIANCE, ROOT, SecondOrder, UnknownLoads, packed_root
 from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import design_matrix
 from morph_dslam.studies.problem import ParametricStudy, SweepProblem, bounds
@@ -40,6 +44,10 @@ SOUGHT_IN = 6
 STATES_A_TERM, HIGHEST_DEGREE, MOST_TERMS_A_STATE = 3, 4, 0.7
 #: A load that acts to less than this share where the body can move acts on what supports hold.
 ON_MOVING = 0.15
+#: So many of the softest combinations of loads act to second order: a slender body bends to two sides, and twists.
+SOFTEST = 3
+#: Name of their displacements among the responses.
+_SECOND = "second order"
 #: Relative norm of the responses' fields that may be left out, and most functions of the parameters.
 TOLERANCE, MOST_FUNCTIONS = 2e-2, 12
 
@@ -58,6 +66,13 @@ class LoadableProblem(SweepProblem, Protocol):
 
     def response_fields(self, state: Any, loads: Array, responses: Array) -> dict[str, Array]:
         """By the names in the model file, (c, n, k) for each of ``loads`` (c, n_dofs) with its response (c, n_dofs)."""
+        ...
+
+    def second_order(self, state: Any, responses: Array) -> Array | None:
+        """The displacement (p, n, 3) of the nodes that the product of two loads' coefficients adds; None if unknown.
+
+        Of each pair a <= b of ``responses`` (s, n_dofs), row by row.
+        """
         ...
 
 
@@ -90,17 +105,11 @@ def reduce_unknown_loads(
     # Loads at places that supports hold move nothing, and have no size that they could be measured by.
     moving = (energies > SOFTLESS * energies.max()) & (_moving_share(surface, tractions, changes) >= ON_MOVING)
     tractions = tractions[moving] / np.sqrt(energies[moving])[:, None, None]
-    responses: dict[str, list[NDArray]] = {}
-    for file in tqdm(samples.files, desc="responses to loads", unit="state"):
-        state = problem.unpack(load_state(file))
-        compliance, changes = surface.compliance(tractions, problem.response(state))
-        fields = problem.response_fields(state, surface.loads(tractions), changes)
-        stacked = {name: np.moveaxis(part, 0, 1).reshape(part.shape[1], -1) for name, part in fields.items()}
-        for name, values in (stacked | {ROOT: packed_root(compliance)[None]}).items():
-            responses.setdefault(name, []).append(values.astype(np.float32))
+    responses, soft = _responses(problem, surface, tractions, samples.files)
     nodal = surface.nodal(tractions)
     nodes = np.flatnonzero(np.abs(nodal).max(axis=(0, 2)) > 0.0)
     reduced = {name: samples.reduced(values) for name, values in responses.items()}
+    second = reduced.pop(_SECOND, None)
     loads = UnknownLoads(
         section.on,
         inward,
@@ -108,6 +117,7 @@ def reduce_unknown_loads(
         np.ascontiguousarray(np.moveaxis(nodal[:, nodes], 0, 2)),
         surface.resultants(tractions, snapshots.mesh.nodes),
         {name: field for name, (field, _) in reduced.items()},
+        None if second is None else SecondOrder(soft, second[0]),
     )
     return loads, {
         "surface": section.on,
@@ -116,6 +126,45 @@ def reduce_unknown_loads(
         "states": len(samples.files),
         "response_error": reduced["displacement"][1],
     }
+
+
+def _responses(
+    problem: LoadableProblem, surface: LoadedSurface, tractions: Array, files: Sequence[Path]
+) -> tuple[dict[str, list[NDArray]], Array]:
+    """What tractions (m, a, k) do in each of the solved states, by field, and their softest combinations (s, m)."""
+    found, soft, combined = dict[str, list[NDArray]](), np.empty(0), np.empty(0)
+    for number, file in enumerate(tqdm(files, desc="responses to loads", unit="state")):
+        state = problem.unpack(load_state(file))
+        compliance, changes = surface.compliance(tractions, problem.response(state))
+        fields = problem.response_fields(state, surface.loads(tractions), changes)
+        if number == 0:
+            soft, combined = softest_combinations(compliance, fields["displacement"])
+        second = problem.second_order(state, combined @ changes)
+        fields |= {} if second is None else {_SECOND: second}
+        stacked = {name: np.moveaxis(part, 0, 1).reshape(part.shape[1], -1) for name, part in fields.items()}
+        for name, values in (stacked | {ROOT: packed_root(compliance)[None]}).items():
+            found.setdefault(name, []).append(values.astype(np.float32))
+    return found, soft
+
+
+def softest_combinations(compliance: Array, displacement: Array) -> tuple[Array, Array]:
+    """The combinations of m loads that move the nodes most for the energy that they need.
+
+    Parameters
+    ----------
+    compliance : (m, m), J.
+    displacement : (m, n, 3) of the nodes by each load, metres.
+
+    Returns
+    -------
+    soft : (s, m) to the coefficients of the combinations from those of the loads, in the sense of the energy.
+    combined : (s, m) the loads' coefficients in each combination, whose energy is half a joule.
+    """
+    m = len(compliance)
+    flat = displacement.reshape(m, -1)
+    held = compliance + LEAST_COMPLIANCE * np.trace(compliance) / m * np.eye(m)
+    _, vectors = scipy.linalg.eigh(flat @ flat.T, held, subset_by_index=[max(m - SOFTEST, 0), m - 1])
+    return vectors.T @ held, vectors.T
 
 
 def _moving_share(surface: LoadedSurface, tractions: Array, changes: Array) -> Array:
