@@ -346,3 +346,23 @@ def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_
     assert finished[1]["one_over_the_sequence"] == []
     with pytest.raises(TrackingError, match="'bend' cannot be a per-sequence parameter"):
         track(options(inputs, tmp_path / "other", tracker=TrackerOptions(per_sequence=("bend",))))
+
+
+def test_what_a_sensor_knows_is_in_the_result(inputs, tmp_path):
+    """A twist that is known exactly in two frames, and one that is a degree off in another, with little deviation."""
+    twists = {number: np.degrees(sheet_state(time).parameters[2]) for number, time in enumerate(TIMES, 20)}
+    rows = [f"21,{twists[21]},0.01", f"22,{twists[22]},0.01", f"23,{twists[23] + 1.0},0.01"]
+    (tmp_path / "known.csv").write_text("\n".join(["frame,twist_deg,twist_std_deg", *rows]))
+    track(options(inputs, tmp_path / "run", known=tmp_path / "known.csv", video=False))
+    with (tmp_path / "run" / "frames.csv").open() as file:
+        found = {int(row["frame"]): row for row in csv.DictReader(file)}
+    for number, away in ((21, 0.0), (22, 0.0), (23, 1.0)):
+        assert float(found[number]["twist_deg"]) == pytest.approx(twists[number] + away, abs=0.0301)
+    assert float(found[21]["twist_std_deg"]) < 0.011
+    # In the frames after it the images alone tell.
+    assert float(found[25]["twist_deg"]) == pytest.approx(twists[25], abs=0.5)
+
+
+def test_known_parameters_of_a_live_run_are_refused(inputs, tmp_path):
+    with pytest.raises(TrackingError, match=r"Tracker\.know"):
+        track(options(inputs, tmp_path / "run", known=tmp_path / "known.csv", live=True))

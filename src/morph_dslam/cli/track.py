@@ -48,6 +48,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="frame that the landmarks, or another start, belong to (default: the first one tracked); with "
         "--registration and --with: one in which the object is undeformed",
     )
+    groups.measured.add_argument(
+        "--known",
+        type=Path,
+        metavar="CSV",
+        help="parameters that something else measured, by frame: columns frame, pressure_kPa and perhaps "
+        "pressure_std_kPa (default deviation: half a percent of the range)",
+    )
     add_flag(
         groups.measured,
         "--refine",
@@ -244,6 +251,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         map_path=arguments.map,
         inner=tuple(arguments.inner),
         points=tuple(arguments.point),
+        known=getattr(arguments, "known", None),
         reregister_at=frames_of(""),
         tracker=replace(
             tracker,

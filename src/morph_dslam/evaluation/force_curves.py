@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import EvaluationError
 from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]
@@ -129,20 +130,6 @@ def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, flo
             f"{parameter_columns(model)}"
         )
     return found
-
-
-def parameter_of_column(header: str, model: ReducedModel) -> tuple[str, float] | None:
-    """The parameter that a column such as ``stroke_mm`` holds, and the factor of its values to SI; None if none."""
-    name, unit = name_and_unit(header)
-    for parameter in model.parameters:
-        if parameter.name == name and unit in FACTORS[parameter.quantity]:
-            return name, FACTORS[parameter.quantity][unit]
-    return None
-
-
-def parameter_columns(model: ReducedModel) -> str:
-    """How columns with the model's parameters are named, for messages."""
-    return ", ".join(f"{parameter.name}_{parameter.unit}" for parameter in model.parameters)
 
 
 def _numbers(where: str, row: Sequence[str], at: int) -> tuple[float, float]:

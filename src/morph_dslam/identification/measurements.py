@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import ReactionInDirection
-from morph_dslam.evaluation.force_curves import ForceCurve, parameter_columns, parameter_of_column
+from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
+from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.model.reduced_model import FORCE, REACTION
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.units import FACTORS

@@ -121,6 +121,11 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         f"--refine-camera (refine_camera) estimates {' and '.join(TERM_STD)} here: leave out the other terms",
     ),
     (
+        lambda run: any(part.known is not None for part in run.objects) and (run.live or bool(run.other_cameras)),
+        "a table of known parameters belongs to a recording of one camera: leave out --known or --with; live, your own "
+        "program tells the tracker (Tracker.know)",
+    ),
+    (
         lambda run: run.refine_reference and bool(run.other_cameras),
         "the reference is refined for one camera: leave out --refine or --with",
     ),

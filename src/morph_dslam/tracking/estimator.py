@@ -17,6 +17,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelDeviation
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, huber_covariance
 from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.known_values import KnownParameters
 from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
 from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
 from morph_dslam.tracking.noise import Correlation, Observations, quadratic
@@ -207,6 +208,7 @@ class Estimator:
         self.options = options or EstimationOptions()
         self.box = Box.of(model)
         self.loads = None if model.energy is None else LoadPrior(model.energy, self.options.loads)
+        self.known = KnownParameters(model)
 
     @property
     def _place_of_loads(self) -> slice:
@@ -258,6 +260,11 @@ class Estimator:
             cost, place = cost + of_loads, self._place_of_loads
             hessian[place, place] += information
             gradient[place] += push
+        if len(self.known.indices):
+            of_known, information, push = self.known.terms(state.parameters)
+            cost, rows = cost + of_known, self.known.indices
+            hessian[rows, rows] += information
+            gradient[rows] += push
         return cost, hessian, gradient, residuals
 
     def estimate(
@@ -299,7 +306,7 @@ class Estimator:
         normals = np.zeros_like(pixels) if normals is None else normals
         return minimise(
             lambda state: self.evaluate(points, pixels, weights, state, normals, prior, depths),
-            start, self.box, self.options.max_iterations, self.options.tolerance,
+            start, self.known.bounded(self.box), self.options.max_iterations, self.options.tolerance,
         )  # fmt: skip
 
     def fit(self, measured: Observations, start: State, prior: Prior | None = None) -> Estimate:
@@ -316,13 +323,23 @@ class Estimator:
         """The cost of what was measured, about an estimate made from it."""
         huber = self.options.huber_px
         linear = LinearCost.about(measured, estimate.state, estimate.residuals, self.camera, huber, self.scale)
-        if self.loads is None:
-            return linear
-        hessian, of_priors, place = linear.hessian.copy(), linear.of_depths.copy(), self._place_of_loads
-        information = self.loads.terms(estimate.state.parameters)[1]
-        hessian[place, place] += information
-        of_priors[place, place] += self.loads.squared_px * information
-        return replace(linear, hessian=hessian, of_depths=of_priors)
+        information, of_priors = self.known_information(estimate.state.parameters)
+        return replace(linear, hessian=linear.hessian + information, of_depths=linear.of_depths + of_priors)
+
+    def known_information(self, parameters: Array) -> tuple[Array, Array]:
+        """What unknown loads and known parameters add to the Hessian at parameters (d,), and its covariance.
+
+        Both (d + 6, d + 6): the second is that of the gradient by what is known.
+        """
+        hessian, of_priors = np.zeros((len(self.scale),) * 2), np.zeros((len(self.scale),) * 2)
+        if self.loads is not None:
+            information, place = self.loads.terms(parameters)[1], self._place_of_loads
+            hessian[place, place] += information
+            of_priors[place, place] += self.loads.squared_px * information
+        rows, information = self.known.indices, self.known.terms(parameters)[1]
+        hessian[rows, rows] += information
+        of_priors[rows, rows] += self.known.squared_px * information
+        return hessian, of_priors
 
     def estimate_from(
         self, points: BoundPoints, pixels: Array, weights: Array, starts: Sequence[State]

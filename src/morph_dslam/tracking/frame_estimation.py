@@ -139,10 +139,12 @@ class FrameEstimation:
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
-        self._scout.loads = estimator.loads
+        self._scout.loads, self._scout.known = estimator.loads, estimator.known
         energy = estimator.model.energy
         has_both = energy is not None and len(energy.model.parameters) > 0
         self._study_scout = Estimator(energy.model, estimator.camera, brief) if energy and has_both else None
+        if self._study_scout is not None:
+            self._study_scout.known = estimator.known
         self._last_joined: tuple[BoundPoints, BoundPoints] | None = None
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
@@ -164,6 +166,7 @@ class FrameEstimation:
         estimate, used = None, measurement.valid
         for _ in range(2):
             estimate = self._estimate(measurement, used, start, prior)
+            self._estimator.known.squared_px = max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
             limit = np.clip(self._options.inlier_sigmas * estimate.sigma_px, *self._options.inlier_px)
             with np.errstate(invalid="ignore"):
                 close = np.linalg.norm(estimate.residuals, axis=1) < limit

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
@@ -115,11 +116,19 @@ def _with_systematic_errors(
     return estimate, left.px, warnings
 
 
-def with_model_errors(result: FrameResult, errors: ModelErrors | None) -> FrameResult:
+def with_model_errors(
+    result: FrameResult, errors: ModelErrors | None, measured: NDArray[np.int64] | None = None
+) -> FrameResult:
     """The result with the errors of the model's mesh and of its reduction in its deviations.
 
     They are the same in frames alike, so that they weigh no frame against another: only results have them. Known
     parameters do not get any.
+
+    Parameters
+    ----------
+    result : of a frame.
+    errors : of its model; None where none are known.
+    measured : indices of the parameters that something else than the images tells of.
     """
     estimate = result.estimate
     if errors is None or estimate is None:
@@ -127,6 +136,8 @@ def with_model_errors(result: FrameResult, errors: ModelErrors | None) -> FrameR
     mu, covariance = estimate.state.parameters, estimate.covariance.copy()
     d, by_model = len(mu), errors.at(mu)
     sought = np.diag(covariance)[:d] > 0.0
+    if measured is not None:
+        sought[measured] = False
     by_model = replace(by_model, parameters=np.outer(sought, sought) * by_model.parameters)
     covariance[:d, :d] += by_model.parameters
     return replace(result, estimate=replace(estimate, covariance=covariance, by_model=by_model))

@@ -127,7 +127,7 @@ class PlacedObject:
                 seen=seen,
                 keyframes=self.keyframes,
             )
-        return Tracker(
+        tracker = Tracker(
             self.model,
             self.camera,
             self.registration,
@@ -137,6 +137,8 @@ class PlacedObject:
             seen=seen[0],
             keyframes=None if self.keyframes is None else self.keyframes[0],
         )
+        tracker.estimator.known.values = self.object.known
+        return tracker
 
     def in_frames(self, registration: Registration, frames: Sequence[Frame]) -> PlacedObject:
         """The same object, registered anew in the frames of an instant."""

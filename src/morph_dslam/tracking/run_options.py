@@ -30,6 +30,7 @@ class ObjectOptions(FileOptions):
     inner : structures inside of it (`morph inner`), whose positions are written and drawn.
     points : names of places of it whose displacements are written and plotted, each with its coordinates in the
         undeformed object, metres.
+    known : table of parameters that something else measures, by frame.
     tracker : what is measured, and what earlier frames add.
     """
 
@@ -42,6 +43,7 @@ class ObjectOptions(FileOptions):
     reregister_at: tuple[tuple[int, Path | None], ...] = ()
     inner: tuple[Path, ...] = ()
     points: tuple[Place, ...] = ()
+    known: Path | None = None
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
 
@@ -110,6 +112,7 @@ class TrackOptions(ObjectOptions):
         found += [self.map_path, self.reference_image]
         for part in self.objects:
             found += [part.model, part.landmarks, part.registration, *vars(part.initializer).values(), *part.inner]
+            found.append(part.known)
             found += [path for _, path in part.reregister_at]
         return [Path(path) for path in found if path is not None]
 

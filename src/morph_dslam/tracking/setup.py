@@ -23,6 +23,7 @@ from morph_dslam.registration.registration import Registration, in_scene, load_r
 from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.known_values import KnownValues
 from morph_dslam.tracking.multi_camera import RigCamera
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.options import TrackerOptions
@@ -47,6 +48,7 @@ class TrackedObject:
     at_rest : whether it is undeformed in the frame of its landmarks.
     snap : whether its outline in the frame of landmarks corrects them.
     points : places of it that are followed by name; None where there are none.
+    known : parameters that something else measures; None where there are none.
     """
 
     name: str
@@ -60,6 +62,7 @@ class TrackedObject:
     at_rest: bool = False
     snap: bool = False
     points: NamedPoints | None = None
+    known: KnownValues | None = None
 
     @property
     def scene(self) -> Scene | None:
@@ -133,13 +136,16 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     inner = tuple(load_inner_structure(path) for path in part.inner)
     for structure in inner:
         structure.carried_by(model)  # raises before the tracking if it is not for this model
-    points = NamedPoints.of(model, part.points)
+    points, known = (
+        NamedPoints.of(model, part.points),
+        None if part.known is None else KnownValues.read(part.known, model),
+    )
     again = {n: None if path is None else load_landmarks(path) for n, path in part.reregister_at}
     options = part.tracker
     if part.registration is None:
         start = initializer if part.landmarks is None else load_landmarks(part.landmarks)
         assert start is not None
-        said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap, "points": points}
+        said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap, "points": points, "known": known}
         return TrackedObject(name, model, start, options, inner, reregister_at=again, **said)
     registration, path = load_registration(part.registration, model), map_of(part.registration, run.map_path)
     if path is None and options.pose != "free":
@@ -151,7 +157,16 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     keyframes = registered_keyframes(registration)
     # Not the model of the file: beside a copy with an open angle it would be kept for nothing.
     return TrackedObject(
-        name, registration.model, registration, options, inner, keyframes, again, run.click_px, points=points
+        name,
+        registration.model,
+        registration,
+        options,
+        inner,
+        keyframes,
+        again,
+        run.click_px,
+        points=points,
+        known=known,
     )
 
 

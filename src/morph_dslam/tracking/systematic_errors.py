@@ -223,7 +223,7 @@ class SystematicErrors:
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
-        hessian = frame.hessian + past
+        hessian = frame.hessian + past + self._estimator.known_information(estimate.state.parameters)[0]
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)

@@ -7,7 +7,7 @@ changes: the previous frames only say where to start.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -185,6 +185,7 @@ class Tracker:
             If image or depth is not of the camera's size, or of another type.
         """
         camera = localization or self.locate(frame)
+        self.estimator.known.begin(frame.index if isinstance(frame, Frame) else None)
         with frame_clock(STAGES) as clock:
             image = self._prepare(frame, occluder_depth, camera.image)
             prior = self._predict(camera)
@@ -202,10 +203,25 @@ class Tracker:
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
             change = self._choose_view(image, hypothesis, result)
-            result = with_model_errors(result, self._model_errors)
+            result = with_model_errors(result, self._model_errors, self.estimator.known.indices)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
+
+    def know(self, values: Mapping[str, float | tuple[float, float]]) -> None:
+        """Take in what something else measures of parameters, in the next frames, such as a pressure.
+
+        Parameters
+        ----------
+        values : by the parameter's name its value, SI, or that with its standard deviation; by default this is a
+            two-hundredth of the range. An empty mapping ends it.
+
+        Raises
+        ------
+        TrackingError
+            If the model has no such parameter, or a value is not in its range.
+        """
+        self.estimator.known.tell(values)
 
     def locate(self, frame: Frame | NDArray[np.uint8]) -> CameraLocalization:
         """Find the camera of the next frame in the map, and with it the object's pose there.

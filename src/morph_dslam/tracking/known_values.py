@@ -1,0 +1,217 @@
+"""Parameters that something else measures while the camera records, such as a pressure: values and deviations by frame.
+
+They are one more term of the cost in their frames, as a prior on the parameters is. What a sensor knows needs not to be
+found from images, which may then tell of other things: a force at the tip of a finger from the pressure in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.errors import TrackingError
+from morph_dslam.io.text import read_csv
+from morph_dslam.model import ReducedModel
+from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
+from morph_dslam.tracking.levenberg_marquardt import Box
+
+Array = NDArray[np.float64]
+FRAME, STD = "frame", "_std_"
+#: An estimate is within so many standard deviations of what is known.
+FARTHEST = 3.0
+#: Without a deviation, a value is known to this part of its range.
+USUAL_STD = 0.005
+#: Values may lie outside of the range by this part of it: a sensor has noise, also where nothing acts.
+OUTSIDE = 0.02
+
+
+@dataclass(frozen=True)
+class KnownValues:
+    """Values of some parameters in some frames.
+
+    Attributes
+    ----------
+    indices : (k,) of the parameters.
+    by_frame : value and standard deviation (k, 2) of each, SI, by the frame's number; NaN where it is not known.
+    """
+
+    indices: NDArray[np.int64]
+    by_frame: Mapping[int, Array]
+
+    @classmethod
+    def read(cls, path: Path, model: ReducedModel) -> KnownValues:
+        """A CSV file with the columns ``frame`` and, by parameter, ``pressure_kPa`` and perhaps ``pressure_std_kPa``.
+
+        Raises
+        ------
+        TrackingError
+            If it cannot be read, has other columns, or values that are no numbers, or not in the parameter's range.
+        """
+        (_, header), *lines = read_csv(path, "table of known parameters", TrackingError) or [(1, [])]
+        columns = _Columns.of(path, header, model)
+        by_frame: dict[int, Array] = {}
+        for line, cells in lines:
+            frame, values = columns.row(f"{path}, line {line}", cells)
+            if frame in by_frame:
+                raise TrackingError(f"{path}, line {line}: frame {frame} is there already; give each frame once")
+            by_frame[frame] = values
+        if not any(np.isfinite(values[:, 0]).any() for values in by_frame.values()):
+            raise TrackingError(f"{path} has no value of a parameter")
+        return cls(columns.indices, by_frame)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Where a table has what: columns (k,) of the values, and of their deviations, -1 where there are none."""
+
+    frame: int
+    indices: NDArray[np.int64]
+    values: Sequence[int]
+    deviations: Sequence[int]
+    factors: Array
+    model: ReducedModel
+
+    @classmethod
+    def of(cls, path: Path, header: Sequence[str], model: ReducedModel) -> _Columns:
+        found: dict[str, dict[bool, tuple[int, float]]] = {}
+        for number, name in enumerate(header):
+            if name == FRAME:
+                continue
+            is_deviation = STD in name
+            parameter = parameter_of_column(name.replace(STD, "_"), model)
+            if parameter is None:
+                raise TrackingError(
+                    f"{path}: '{name}' is no column with a parameter of the model; write {FRAME}, "
+                    f"{parameter_columns(model)}, and deviations with _std before the unit"
+                )
+            if is_deviation in found.setdefault(parameter[0], {}):
+                raise TrackingError(f"{path}: two columns hold the parameter {parameter[0]}; leave one out")
+            found[parameter[0]][is_deviation] = (number, parameter[1])
+        named = [name for name, parts in found.items() if False in parts]
+        if FRAME not in header or not named:
+            raise TrackingError(f"{path} needs the columns {FRAME} and one or more of {parameter_columns(model)}")
+        if alone := sorted(set(found) - set(named)):
+            raise TrackingError(f"{path} has a deviation of {alone[0]}, but no value: add its column")
+        names = [parameter.name for parameter in model.parameters]
+        return cls(
+            list(header).index(FRAME),
+            np.array([names.index(name) for name in named], dtype=np.int64),
+            [found[name][False][0] for name in named],
+            [found[name].get(True, (-1, 1.0))[0] for name in named],
+            np.array([[found[name][False][1], found[name].get(True, (-1, 1.0))[1]] for name in named]),
+            model,
+        )
+
+    def row(self, where: str, cells: Sequence[str]) -> tuple[int, Array]:
+        """Frame, and values and deviations (k, 2), SI, of a line."""
+        frame = _number(where, cells, self.frame)
+        if not frame.is_integer():
+            raise TrackingError(f"{where}: '{cells[self.frame]}' is no number of a frame")
+        values = np.array([[_number(where, cells, k) for k in self.values], self._deviations(where, cells)]).T
+        values *= self.factors
+        for k, (value, deviation) in zip(self.indices.tolist(), values, strict=True):
+            check_known(where, self.model, k, value, deviation)
+        return int(frame), with_usual_deviations(self.model, self.indices, values)
+
+    def _deviations(self, where: str, cells: Sequence[str]) -> list[float]:
+        return [np.nan if k < 0 else _number(where, cells, k) for k in self.deviations]
+
+
+def _number(where: str, cells: Sequence[str], column: int) -> float:
+    """A cell's number; NaN where it is empty, but for the frame's."""
+    text = cells[column] if column < len(cells) else ""
+    try:
+        return float(text or "nan")
+    except ValueError:
+        raise TrackingError(f"{where}: '{text}' is no number") from None
+
+
+def check_known(where: str, model: ReducedModel, index: int, value: float, deviation: float) -> None:
+    """Raise TrackingError unless a value, SI, is in its range and its deviation above zero; either may be NaN."""
+    parameter = model.parameters[index]
+    margin = OUTSIDE * (parameter.upper - parameter.lower)
+    if np.isinf(value) or value < parameter.lower - margin or value > parameter.upper + margin:
+        low, high = (f"{parameter.display(end):g}" for end in (parameter.lower, parameter.upper))
+        raise TrackingError(
+            f"{where}: {parameter.name} is {parameter.display(value):g} {parameter.unit}, outside of the model's range "
+            f"from {low} to {high} {parameter.unit}: check its unit, or build the model with a wider range"
+        )
+    if np.isinf(deviation) or deviation <= 0.0:
+        raise TrackingError(f"{where}: the deviation of {parameter.name} is not above zero: leave it out if unknown")
+
+
+def with_usual_deviations(model: ReducedModel, indices: NDArray[np.int64], values: Array) -> Array:
+    """Values and deviations (k, 2) of parameters with the usual deviation where there is none."""
+    found = values.copy()
+    usual = USUAL_STD * (model.upper - model.lower)[indices]
+    found[:, 1] = np.where(np.isnan(values[:, 1]), usual, values[:, 1])
+    return found
+
+
+class KnownParameters:
+    """The term of the cost from what is known of parameters in the present frame.
+
+    Attributes
+    ----------
+    values : of a recording; None where there are none.
+    squared_px : variance of an image coordinate, which turns likelihoods into costs in squared pixels.
+    """
+
+    def __init__(self, model: ReducedModel) -> None:
+        self._model, self.squared_px = model, 0.25
+        self.values: KnownValues | None = None
+        self._indices, self._now = np.empty(0, dtype=np.int64), np.empty((0, 2))
+
+    def begin(self, frame: int | None) -> None:
+        """A frame of this number begins: its values of the recording's table count, if there is one."""
+        if self.values is None:
+            return
+        now = self.values.by_frame.get(-1 if frame is None else frame)
+        self._set(self.values.indices, np.empty((0, 2)) if now is None else now)
+
+    def tell(self, known: Mapping[str, float | tuple[float, float]]) -> None:
+        """Values, SI, by parameter, each perhaps with its standard deviation, from now on; none with an empty mapping.
+
+        Raises
+        ------
+        TrackingError
+            If the model has no such parameter, or the value is not in its range.
+        """
+        names = [parameter.name for parameter in self._model.study_parameters]
+        if wrong := [name for name in known if name not in names]:
+            raise TrackingError(f"'{wrong[0]}' is not a parameter of the model: these are {', '.join(names) or 'none'}")
+        pairs = [value if isinstance(value, tuple) else (value, np.nan) for value in known.values()]
+        values = np.array(pairs, dtype=np.float64).reshape(-1, 2)
+        indices = np.array([names.index(name) for name in known], dtype=np.int64)
+        for k, (value, deviation) in zip(indices.tolist(), values, strict=True):
+            check_known("known parameters", self._model, k, value, deviation)
+        self._set(indices, with_usual_deviations(self._model, indices, values))
+
+    def _set(self, indices: NDArray[np.int64], values: Array) -> None:
+        there = np.isfinite(values[:, 0])
+        self._indices, self._now = indices[: len(values)][there], values[there]
+
+    @property
+    def indices(self) -> NDArray[np.int64]:
+        """Of the parameters (k,) that are known in the present frame."""
+        return self._indices
+
+    def bounded(self, box: Box) -> Box:
+        """The box with known parameters near their values: what a model cannot explain does not outweigh a sensor."""
+        if not len(self._indices):
+            return box
+        lower, upper, (value, deviation) = box.lower.copy(), box.upper.copy(), self._now.T
+        rows, most = self._indices, FARTHEST * deviation
+        lower[rows] = np.clip(value - most, box.lower[rows], box.upper[rows])
+        upper[rows] = np.clip(value + most, box.lower[rows], box.upper[rows])
+        return replace(box, lower=lower, upper=upper)
+
+    def terms(self, parameters: Array) -> tuple[float, Array, Array]:
+        """Cost, and its Hessian's diagonal (k,) and gradient (k,) at parameters (n,); in squared pixels."""
+        information = self.squared_px / self._now[:, 1] ** 2
+        away = parameters[self._indices] - self._now[:, 0]
+        return 0.5 * float(information @ away**2), information, information * away
