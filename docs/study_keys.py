@@ -86,6 +86,8 @@ def _name(annotation: Any) -> str:
     if origin is tuple:
         names = [_name(argument) for argument in arguments if argument is not Ellipsis]
         return f"list of {names[0]}" if Ellipsis in arguments else "[" + ", ".join(names) + "]"
+    if origin is dict:
+        return f"{_name(arguments[1])}, by name"
     if origin is Union or type(annotation).__name__ == "UnionType":
         return " or ".join(dict.fromkeys(_name(argument) for argument in arguments if argument is not NoneType))
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -98,7 +100,7 @@ def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "required"
     default = field.get_default(call_default_factory=True)
-    return "none" if default is None else f"`{_shown(default)}`"
+    return "none" if default is None or default == {} else f"`{_shown(default)}`"
 
 
 def _shown(value: Any) -> str:

@@ -7,7 +7,9 @@ from math import pi
 
 from morph_dslam.errors import StudyError
 
-_STRESS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "N/mm2": 1e6, "bar": 1e5, "mbar": 1e2}
+#: A pound is 0.45359237 kg, its weight that under 9.80665 m/s2, an inch 25.4 mm: all exact by definition.
+_PSI = 0.45359237 * 9.80665 / 0.0254**2
+_STRESS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "N/mm2": 1e6, "bar": 1e5, "mbar": 1e2, "psi": _PSI}
 #: Factor from each accepted unit to SI, by the quantity it measures.
 FACTORS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},

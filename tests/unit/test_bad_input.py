@@ -26,7 +26,7 @@ from morph_dslam.model import load_model, save_model
 from morph_dslam.reduction.report_pictures import read_reference_curve
 from morph_dslam.registration.board import load_board
 from morph_dslam.registration.messages import WrongUnit
-from morph_dslam.studies.external import read_table
+from morph_dslam.studies.external_table import SolutionTable
 from morph_dslam.studies.study import load_study
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.block_study import STUDY, write_study
@@ -353,7 +353,7 @@ def test_what_a_model_is_made_from_is_no_model(folder):
     [
         (load_landmarks, "x_mm;y_mm;z_mm;u_px;v_px\n1,5;2;3;4;5\n"),
         (load_tracks, "frame;id;u;v\n1;a;2,5;3\n"),
-        (read_table, "file;force [N]\nrun0.vtu;0,5\n"),
+        (SolutionTable, "file;force [N]\nrun0.vtu;0,5\n"),
         (read_reference_curve, "modes;the paper\n1;0,9\n"),
         (lambda path: read_path(bent_sheet_model(3, 3), path, np.zeros(3)), "arch_mm;time\n0,5;1\n"),
     ],

@@ -4,6 +4,7 @@ import tomllib
 from pathlib import Path
 
 import cv2
+import netgen.occ as occ
 import ngsolve as ngs
 import numpy as np
 import pytest
@@ -24,13 +25,15 @@ from morph_dslam.registration.picture import load_picture
 from morph_dslam.render.scene_file import load_scene_file
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.defaults import resolve_defaults
-from morph_dslam.studies.external import ExternalStudy, read_table
+from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.external_table import SolutionTable
 from morph_dslam.studies.sections import UnknownLoadsSection
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, samples
+from tests.support.meshes import surface_area
 from tests.support.run_folders import exact_truth, write_run
 from tests.support.scenes import MOTION, write_scene
 
@@ -51,7 +54,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration-aids", "csv"): 1,
         ("shell-study", "toml"): 2,
         ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 8,
+        ("solid-study", "toml"): 10,
         ("study-file", "toml"): 1,
     }
 
@@ -204,6 +207,24 @@ def test_sets_by_their_place():
     assert np.linalg.norm(spot - [0.012, 0.004, 0.031], axis=1).max() <= 0.009
 
 
+def test_the_wall_of_a_chamber_with_an_inlet(tmp_path):
+    """A chamber of 12 x 9 x 11.5 mm with an inlet of 1 mm diameter, 6 mm long."""
+    air = occ.Box((6, 2.5, 2.5), (18, 11.5, 14)) + occ.Cylinder((0, 7, 8), occ.X, r=0.5, h=7)
+    (occ.Box((0, 0, 0), (24, 14, 16)) - air).WriteStep(str(tmp_path / "part.step"))
+    study = {
+        "name": "actuator",
+        "mesh": {"file": str(tmp_path / "part.step"), "unit": "mm", "size": "4 mm"},
+        "materials": {"silicone": {"law": "neo_hookean", "young": "0.1 MPa", "poisson": 0.45}},
+        "supports": [{"kind": "fixed", "on": "x_max"}],
+        "parameters": {"inflate": {"range": ["0 kPa", "10 kPa"]}},
+    }
+    made = make_study(study | tomllib.loads(samples("solid-study", "toml")[2]))
+    assert isinstance(made, SolidStudy)
+    area = 1e6 * surface_area(made.solid_mesh(), "chamber")
+    wall = 2 * (12 * 9 + 12 * 11.5 + 9 * 11.5) - np.pi * 0.25
+    assert wall * 0.9995 < area < (wall + np.pi * 6) * 1.0005
+
+
 def test_a_strip_that_buckles_upwards_first():
     study = {
         "name": "strip",
@@ -211,7 +232,7 @@ def test_a_strip_that_buckles_upwards_first():
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
         "parameters": {"weight": {"range": ["0 Pa", "30 Pa"], "default": "20 Pa"}},
     }
-    sample = tomllib.loads(samples("solid-study", "toml")[2])
+    sample = tomllib.loads(samples("solid-study", "toml")[3])
     weight = {"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-1 * weight"]}
     supports, loads = [{"kind": "fixed", "on": "x_min"}, *sample["supports"]], [*sample["loads"], weight]
     sweep = make_study(study | {"supports": supports, "loads": loads}).sweep_problem()
@@ -227,7 +248,7 @@ def test_a_bar_with_a_fitting_at_its_end():
         "supports": [{"kind": "fixed", "on": "x_min"}],
         "parameters": {"pull": {"range": ["0 N", "0.1 N"]}, "bend": {"range": ["-5 N.mm", "5 N.mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[3])
+    study |= tomllib.loads(samples("solid-study", "toml")[4])
     sweep = make_study(study).sweep_problem()
     outputs = sweep.take_snapshot(sweep.advance(sweep.first_state(), np.array([0.05, 2e-3]))).outputs
     place = np.array([0.12, 0.0, 0.025]) + outputs["translation_x_max"]
@@ -245,7 +266,7 @@ def test_a_ball_that_presses_on_a_block():
         "supports": [{"kind": "fixed", "on": "z_min"}],
         "parameters": {"depth": {"range": ["0 mm", "8 mm"]}} | places,
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[4])
+    study |= tomllib.loads(samples("solid-study", "toml")[5])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert resolve_defaults(made).reduction.method == "pod"
@@ -272,7 +293,7 @@ def test_shape_of_a_solid():
         "supports": [{"kind": "fixed", "on": "bottom"}],
         "parameters": {"growth": {"range": ["-0.5 mm", "1 mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[5])
+    study |= tomllib.loads(samples("solid-study", "toml")[6])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert [shape.kind for shape in made.shape] == ["thickness"]
@@ -281,13 +302,18 @@ def test_shape_of_a_solid():
 
 
 def test_solutions_of_another_program(tmp_path):
-    study = make_study(tomllib.loads(samples("solid-study", "toml")[7]), tmp_path)
+    section, reactions = samples("solid-study", "toml")[-2:]
+    study = make_study(tomllib.loads(section), tmp_path)
     assert isinstance(study, ExternalStudy)
     (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
-    parameters, values, rows = read_table(study.external.table)
+    table = SolutionTable(study.external.table)
+    parameters, values = table.parameters()
     assert [parameter.name for parameter in parameters] == ["force", "tilt"]
     np.testing.assert_allclose(values[0], [0.5, np.radians(-3.0)])
-    assert rows[0]["file"] == "run0.vtu"
+    assert table.rows[0]["file"] == "run0.vtu"
+    named = make_study(tomllib.loads(f'{section}force_unit = "N"\n{reactions}'), tmp_path)
+    assert isinstance(named, ExternalStudy)
+    assert list(named.external.reactions) == ["base", "punch"]
 
 
 def run_sample(page: str, number: int = 0) -> dict:
@@ -372,5 +398,5 @@ def test_evaluation_in_memory(tmp_path, monkeypatch):
 
 
 def test_unknown_loads():
-    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[6])["unknown_loads"])
+    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[7])["unknown_loads"])
     assert (section.on, section.direction, section.modes) == ("top", "inward", 60)

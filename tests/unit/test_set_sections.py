@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import meshio
+import netgen.occ as occ
 import numpy as np
 import pytest
 import trimesh
@@ -98,9 +99,26 @@ def test_loads_supports_and_materials_take_them():
     study = make_study(content)
     # The middles of 5 mm cells that are within 8 mm of the centre: (2.5, 2.5, 2.5) and (7.5, 2.5, 2.5) is 8.29 away.
     assert len(study.solid_mesh().cells("core")) == 8
-    assert (
-        study.fingerprint() != make_study(content | {"sets": content["sets"] | {"more": {"of": "z_min"}}}).fingerprint()
-    )
+
+
+def test_solutions_stay_what_they_are_until_a_set_that_they_depend_on_changes():
+    held = {"held": {"box": [mm(0, 0, 0), mm(4, 20, 10)]}}
+    supports = [{"kind": "fixed", "on": "held"}]
+    turned = {"kind": "rotation", "on": "x_max", "axis": [1, 0, 0], "angle": "1 deg", "centre": "pivot"}
+
+    def fingerprint(sets, **changes):
+        return make_study(BLOCK | {"supports": supports, "sets": held | sets} | changes).fingerprint()
+
+    of_all = fingerprint({})
+    for name, section in (("top", {"of": "z_max"}), ("part", {"box": [mm(0, 0, 0), mm(20, 20, 10)]})):
+        assert fingerprint({name: section}) == of_all, "nothing names it"
+    loads = {"unknown_loads": {"on": ["z_min", "y_min"], "modes": 5}}
+    assert fingerprint({}, **loads) == of_all, "unknown loads act on solutions that are there"
+    assert fingerprint({"held": {"box": [mm(0, 0, 0), mm(6, 20, 10)]}}) != of_all
+    joint = [{"kind": "pressure", "on": ["z_max", "y_max"], "pressure": "p"}]
+    assert fingerprint({}, loads=joint) != of_all
+    pivots = [fingerprint({"pivot": {"nearest": mm(40, y, 0)}}, supports=[*supports, turned]) for y in (0, 20)]
+    assert len({*pivots, of_all}) == 3, "the centre of a rotation may be a set"
 
 
 @pytest.mark.parametrize(
@@ -192,3 +210,87 @@ def test_a_shell_has_cells_for_faces():
         2 * np.pi * 0.05**2 * (1 - np.cos(np.pi / 6)), rel=0.01
     )
     assert faces_figures(mesh, sizes["side"])[0] == pytest.approx(np.pi * 0.05**2, rel=0.03)
+
+
+#: A bellows: chambers of 12 x 9 x 11.5 mm in walls of 2 mm, 2 mm apart, joined by a channel of 4 x 1.5 mm in the base.
+CHAMBERS = 3 * 2 * (12 * 9 + 12 * 11.5 + 9 * 11.5)
+#: The channel is 20 mm long besides: four walls on the way, and two ends of 1 mm; its mouths into chambers are open.
+CHANNEL = (1 + 6 + 6 + 1) * 2 * (4 + 1.5) - 4 * 4 * 1.5
+
+
+def bellows(path, inlet):
+    """A STEP file of the bellows, with an inlet of 1.4 mm diameter and 5 mm length where there is to be one."""
+    body, air = occ.Box((0, 0, 0), (60, 14, 6)), occ.Box((5, 5, 2.5), (55, 9, 4))
+    for x in (4, 22, 40):
+        body += occ.Box((x, 0, 4.5), (x + 16, 14, 16))
+        air += occ.Box((x + 2, 2.5, 2.5), (x + 14, 11.5, 14))
+    if inlet:
+        air += occ.Cylinder((-1, 7, 3.25), occ.X, r=0.7, h=8)
+    (body - air).WriteStep(str(path))
+
+
+def bellows_with(path, **section):
+    content = BLOCK | {"mesh": {"file": str(path), "unit": "mm", "size": "4 mm"}, "sets": {"chosen": section}}
+    content["loads"] = [{"kind": "pressure", "on": "chosen", "pressure": "p"}]
+    return make_study(content).solid_mesh()
+
+
+@pytest.mark.parametrize("inlet", [False, True])
+@pytest.mark.parametrize("point", [(12, 7, 8), (47, 4, 12), (21, 7, 3.2)])
+def test_the_wall_of_a_hollow_is_all_of_its_chambers_and_no_gap_between_them(tmp_path, inlet, point):
+    bellows(tmp_path / "bellows.step", inlet)
+    mesh = bellows_with(tmp_path / "bellows.step", hollow=mm(*point))
+    assert ("cavity_1" in mesh.surfaces) != inlet
+    mouth, wall = (np.pi * 0.7**2, 2 * np.pi * 0.7 * 5) if inlet else (0.0, 0.0)
+    # The inlet's own wall counts up to somewhere near the outside.
+    least, most = CHAMBERS + CHANNEL - mouth, CHAMBERS + CHANNEL - mouth + wall
+    assert 0.9995 * least < 1e6 * area(mesh) < 1.0005 * most
+    middles = 1e3 * mesh.nodes[mesh.face_nodes(mesh.surface("chosen"), corners_only=True)].mean(axis=1)
+    assert ((middles[:, 1:] > [2.4, 2.4]) & (middles[:, 1:] < [11.6, 14.1])).all()
+    assert not ((middles[:, 2] > 4.6) & ((middles[:, 0] - 4) % 18 > 14.1)).any(), "a wall of a gap"
+
+
+def test_hollows_that_are_none(tmp_path):
+    bellows(tmp_path / "bellows.step", inlet=True)
+    for point, message in (
+        ((12, 7, 1), "the point lies in the material"),
+        ((12, 7, 100), "the point lies outside of the solid"),
+        ((21, 7, 10), "so open that its wall has no clear end"),
+    ):
+        with pytest.raises(StudyError, match=f"sets.chosen: .*{message}"):
+            bellows_with(tmp_path / "bellows.step", hollow=mm(*point))
+    content = BLOCK | {"mesh": {"file": str(tmp_path / "bellows.step"), "unit": "mm"}}
+    content["loads"] = [{"kind": "pressure", "on": "cavity_1", "pressure": "p"}]
+    with pytest.raises(StudyError, match=r"no surface 'cavity_1'.* Only a hollow that is closed .* by hollow"):
+        make_study(content).solid_mesh()
+
+
+def cubes(path, kept):
+    """A VTK file of the cubes of 1 mm that are ``kept`` of a grid, their nodes where they touch the same."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    points, cells = np.unique((np.argwhere(kept)[:, None] + corners).reshape(-1, 3), axis=0, return_inverse=True)
+    meshio.Mesh(points.astype(float), {"hexahedron": cells.reshape(-1, 8)}).write(path)
+
+
+def test_the_wall_of_a_hollow_in_hexahedra(tmp_path):
+    """A cube of 8 mm with a hollow of 4 mm and an inlet of 1 x 1 mm, 2 mm long."""
+    kept = np.ones((8, 8, 8), dtype=bool)
+    kept[2:6, 2:6, 2:6] = kept[:2, 3, 3] = False
+    cubes(tmp_path / "box.vtk", kept)
+    content = BLOCK | {"mesh": {"file": str(tmp_path / "box.vtk"), "unit": "mm"}}
+    content |= {"loads": [{"kind": "pressure", "on": "air", "pressure": "p"}], "sets": {"air": {"hollow": mm(4, 4, 4)}}}
+    mesh = make_study(content).solid_mesh()
+    # Faces of 1 mm2: those of the hollow, and of the inlet's four sides either the inner ones alone or all.
+    assert 1e6 * area(mesh, "air") in (pytest.approx(6 * 16 - 1 + 4), pytest.approx(6 * 16 - 1 + 8))
+    content["sets"]["air"] |= {"facing": [1, 0, 0], "angle": "1 deg"}
+    assert 1e6 * area(make_study(content).solid_mesh(), "air") == pytest.approx(15.0)
+
+
+def test_a_cup_is_no_hollow(tmp_path):
+    kept = np.ones((8, 8, 8), dtype=bool)
+    kept[2:6, 2:6, 2:] = False
+    cubes(tmp_path / "cup.vtk", kept)
+    content = BLOCK | {"mesh": {"file": str(tmp_path / "cup.vtk"), "unit": "mm"}}
+    content |= {"loads": [{"kind": "pressure", "on": "air", "pressure": "p"}], "sets": {"air": {"hollow": mm(4, 4, 4)}}}
+    with pytest.raises(StudyError, match="so open that its wall has no clear end"):
+        make_study(content).solid_mesh()

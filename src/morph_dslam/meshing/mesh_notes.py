@@ -13,7 +13,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.mesh_checks import described_extent
 from morph_dslam.meshing.meshes import Mesh
-from morph_dslam.meshing.netgen_meshing import SURFACES, closed_surface
+from morph_dslam.meshing.netgen_meshing import SURFACES, closed_surface, step_volume
 from morph_dslam.surface_distances import distances_to_surface
 from morph_dslam.units import to_si
 
@@ -84,6 +84,8 @@ def file_notes(mesh: Mesh, path: Path, unit: str, size: float | None = None) -> 
     notes = []
     if not mesh.is_sheet and file_kind(path) in SURFACES:
         notes += _surface_notes(mesh, path, to_si(1.0, unit, "length"), size)
+    if not mesh.is_sheet and file_kind(path) == ".step":
+        notes += _step_notes(mesh, path)
     return [*notes, *small_extent_note(np.ptp(mesh.nodes, axis=0), path, unit)]
 
 
@@ -99,12 +101,34 @@ def _surface_notes(mesh: Mesh, path: Path, scale: float, size: float | None) -> 
         return
     found = surface_deviation(mesh, scale * surface.points, surface.triangles)
     if found.notable:
-        smaller = f"{100.0 * abs(found.volume):.2g} % {'smaller' if found.volume < 0.0 else 'larger'} than"
-        volume = smaller if abs(found.volume) > 1e-4 else "as large as"
+        volume = _compared(found.volume) if abs(found.volume) > 1e-4 else "as large as"
         yield (
             f"the mesh is {volume} its file, and up to {1e3 * found.largest:.2g} mm away from its surface "
             f"({1e3 * found.mean:.2g} mm on average): take a smaller size, or leave it out to keep the file's triangles"
         )
+
+
+def _step_notes(mesh: Mesh, path: Path) -> Iterator[str]:
+    """On cells with flat sides, which cut the round sides of a solid short (or, of a hole, fill it)."""
+    try:
+        change = _volume(mesh.nodes[mesh.surface_triangles()]) / step_volume(path) - 1.0
+    except StudyError:  # the file has changed since the mesh was made of it
+        return
+    if abs(change) > OFF_FILE:
+        bending = (1.0 + change) ** 2 - 1.0  # the second moment of a round section goes with its area squared
+        yield (
+            f"the mesh is {_compared(change)} the solids of {path.name}, whose round sides its cells make flat (a rod "
+            f"bends {_per_cent(bending)} too {'easily' if bending < 0.0 else 'little'} by that): take a smaller size"
+        )
+
+
+def _compared(change: float) -> str:
+    """A volume over another, less one, in words."""
+    return f"{_per_cent(change)} {'smaller' if change < 0.0 else 'larger'} than"
+
+
+def _per_cent(part: float) -> str:
+    return f"{100.0 * abs(part):.2g} %"
 
 
 def small_extent_note(extent: Array, path: Path, unit: str) -> list[str]:

@@ -27,6 +27,13 @@ _FACE_TRIANGLES: dict[int, tuple[tuple[int, int, int], ...]] = {
 }
 
 
+#: What the message on a cavity that is not there adds.
+CLOSED_ONLY = (
+    ". Only a hollow that is closed all around is a cavity: name the wall of one with an inlet in [sets.NAME], by "
+    "hollow = a point in it"
+)
+
+
 def natural_order(name: str) -> list[str | int]:
     """A key that sorts "face_2" before "face_10"."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
@@ -129,7 +136,8 @@ class Mesh:
     def _named(self, sets: Mapping[str, Indices], name: str, what: str, more: Mapping = {}) -> Indices:
         if name not in sets:
             known = ", ".join(sorted({*sets, *more}, key=natural_order)) or "none"
-            raise StudyError(f"the mesh has no {what} '{name}'; it has: {known}")
+            why = CLOSED_ONLY if re.fullmatch(r"cavity_\d+", name) else ""
+            raise StudyError(f"the mesh has no {what} '{name}'; it has: {known}{why}")
         return sets[name]
 
     def all_faces(self) -> Indices:
@@ -294,15 +302,19 @@ def with_found_surfaces(mesh: Mesh) -> Mesh:
     return replace(mesh, surfaces={**mesh.surfaces, **new}, found=mesh.found | new.keys())
 
 
+def parts_of(mesh: Mesh, faces: Indices) -> Indices:
+    """Numbers (f,) from 0 of the parts into which faces (f, 2) fall: those that share nodes are of one."""
+    nodes = mesh.face_nodes(faces, corners_only=True)
+    ends = np.concatenate([nodes[nodes[:, k] >= 0][:, [0, k]] for k in range(1, nodes.shape[1])]).T
+    graph = sparse.coo_array((np.ones(ends.shape[1]), ends), shape=(mesh.n_nodes, mesh.n_nodes))
+    labels = csgraph.connected_components(graph, directed=False)[1][nodes[:, 0]]
+    return np.unique(labels, return_inverse=True)[1].ravel()
+
+
 def _cavities(mesh: Mesh) -> dict[str, Indices]:
     """Walls of closed cavities, "cavity_1", ..., in the order of their centres along x, then y, then z."""
     faces = mesh.boundary_faces()
-    nodes = mesh.face_nodes(faces, corners_only=True)
-    pairs = [nodes[nodes[:, k] >= 0][:, [0, k]] for k in range(1, nodes.shape[1])]
-    ends = np.concatenate(pairs).T
-    graph = sparse.coo_array((np.ones(ends.shape[1]), ends), shape=(mesh.n_nodes, mesh.n_nodes))
-    _, labels = csgraph.connected_components(graph, directed=False)
-    of_face, found = labels[nodes[:, 0]], []
+    of_face, found = parts_of(mesh, faces), []
     for label in np.unique(of_face) if len(np.unique(of_face)) > 1 else ():
         wall = faces[of_face == label]
         corners = mesh.nodes[mesh.face_triangles(wall)]

@@ -308,22 +308,40 @@ def mesh_step_file(path: Path, unit: str, size: float | None) -> Mesh:
     stated = [u for u, prefix in _STEP_UNITS.items() if re.search(rf"SI_UNIT\s*\(\s*{prefix}\s*,\s*\.METRE\.", text)]
     if stated and unit not in stated:
         raise StudyError(f"{path} states that its unit of length is {stated[0]}, but '{unit}' is declared")
-    with _quiet(), TemporaryDirectory() as folder:
+    with _quiet(), _step_errors(path):
+        geometry = _step_solids(path)
+        low, high = geometry.shape.bounding_box
+        extent = np.array([high[i] - low[i] for i in range(3)])
+        if size is not None:
+            area = sum(face.mass for face in geometry.shape.faces)
+            _check_cell_size(path, 1e-3 * extent, 1e-9 * geometry.shape.mass, 1e-6 * area, 1e-3 * size)
+        content = geometry.GenerateMesh(maxh=size or float(np.linalg.norm(extent)) / 10.0)
+    return _volume_mesh(content, path)
+
+
+def step_volume(path: Path) -> float:
+    """Volume of the solids of a STEP file, m3. Raises StudyError if they cannot be read, or overlap."""
+    with _quiet(), _step_errors(path):
+        return 1e-9 * float(_step_solids(path).shape.mass)
+
+
+@contextmanager
+def _step_errors(path: Path) -> Iterator[None]:
+    """Make StudyError of what Netgen and Open CASCADE raise, which is plain Exception."""
+    try:
+        yield
+    except StudyError:
+        raise
+    except Exception as error:
+        raise StudyError(f"Netgen could not mesh the solids of {path}: {error}") from error
+
+
+def _step_solids(path: Path) -> Any:
+    """The solids of a STEP file, joined where they touch; millimetres."""
+    with TemporaryDirectory() as folder:
         named = Path(folder) / "solids.step"  # Netgen goes by the name
         named.symlink_to(path.resolve())
-        try:
-            geometry = _joined(occ.OCCGeometry(str(named)), path)
-            low, high = geometry.shape.bounding_box
-            extent = np.array([high[i] - low[i] for i in range(3)])
-            if size is not None:
-                area = sum(face.mass for face in geometry.shape.faces)
-                _check_cell_size(path, 1e-3 * extent, 1e-9 * geometry.shape.mass, 1e-6 * area, 1e-3 * size)
-            content = geometry.GenerateMesh(maxh=size or float(np.linalg.norm(extent)) / 10.0)
-        except StudyError:
-            raise
-        except Exception as error:  # Netgen and Open CASCADE raise plain Exception
-            raise StudyError(f"Netgen could not mesh the solids of {path}: {error}") from error
-    return _volume_mesh(content, path)
+        return _joined(occ.OCCGeometry(str(named)), path)
 
 
 def _joined(geometry: Any, path: Path) -> Any:

@@ -67,9 +67,12 @@ def stability_report(
 
 
 def stability_warnings(certificate: dict[str, Any]) -> list[str]:
-    """Lines for whoever builds a model; none where all solutions are known to be stable."""
+    """Lines for whoever builds a model, on solutions that are known to be unstable, and on what was passed.
+
+    That the solver cannot tell, as under every follower pressure, the certificate says.
+    """
     report = certificate.get("stability")
-    if report is None or not report["unstable"] + report["unknown"] + len(report["passed"]):
+    if report is None or not report["unstable"] + len(report["passed"]):
         return []
     lines = [report["statement"]]
     for place in report["passed"][:3]:

@@ -35,7 +35,7 @@ from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
-from morph_dslam.studies.study import Study, load_study, study_mesh_notes
+from morph_dslam.studies.study import Study, load_study, study_file, study_mesh_notes
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 
 #: Fewer held-out solutions than these say nothing of the error.
@@ -112,7 +112,7 @@ def build(
         return _built(described, text, output, workers, executor)
     except StudyError as error:
         if isinstance(study, str | Path):
-            raise StudyError(f"{_file_of(study)}: {error}") from error
+            raise StudyError(f"{study_file(study)}: {error}") from error
         raise
 
 
@@ -135,6 +135,8 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
     model.provenance.update(provenance(text, chosen, model))
     doubts = _unstrained(snapshots) or _doubtful(model)
+    if isinstance(chosen, ExternalStudy):
+        doubts += chosen.doubts([*(group[0] for group in snapshots.training), *snapshots.held_out])
     if found := [*mesh_notes, *_unresolved(chosen, snapshots), *study_warnings(chosen), *doubts]:
         model.certificate["warnings"] = found
     with writing(StudyError, output):
@@ -237,13 +239,8 @@ def _read(study: str | Path | Study) -> tuple[Study, str]:
         )
     if not isinstance(study, str | Path):
         return study, study.model_dump_json()
-    path = _file_of(study)
+    path = study_file(study)
     return load_study(path), path.read_text()
-
-
-def _file_of(study: str | Path) -> Path:
-    path = Path(study)
-    return path / "study.toml" if path.is_dir() else path
 
 
 def _check_held_out(study: Study, snapshots: Snapshots, output: Path) -> None:
@@ -284,7 +281,8 @@ def certified_model(
     )
     model, method = _reduced(task, method, fallback)
     announce(f"measuring errors at {len(held_out)} held-out solutions")
-    model.certificate.update(certify(model, held_out))
+    # Nobody knows how another program's states lie in the box.
+    model.certificate.update(certify(model, held_out, scattered=snapshots.problem is not None))
     model.certificate["compression_percent"] = compression_percent(model, len(training) + len(held_out))
     model.certificate["samples"] = _samples(snapshots)
     if method.adaptive:

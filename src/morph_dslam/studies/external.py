@@ -6,41 +6,36 @@ are not known, so the functions of the parameters are fitted to values only.
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import meshio
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.text import read_csv
-from morph_dslam.meshing.meshes import CellBlock, Mesh, model_mesh_of
+from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
+from morph_dslam.studies.external_checks import check_strain, check_stress
+from morph_dslam.studies.external_doubts import doubts
+from morph_dslam.studies.external_mesh import announced_mesh, check_same, mesh_of, used_nodes
+from morph_dslam.studies.external_reactions import PointForces, as_fields, columns_of
+from morph_dslam.studies.external_table import SolutionTable
 from morph_dslam.studies.problem import ModelMesh, Snapshot
 from morph_dslam.studies.sections import LengthUnit, ReductionSection, Section, StressUnit, StudyPath
-from morph_dslam.studies.solid_sections import check_unit
-from morph_dslam.studies.solution_files import SAME, point_data, read_solution
-from morph_dslam.units import quantity_of, to_si
+from morph_dslam.studies.solution_files import point_data, read_solution
+from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
-#: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
-_CELL_TYPES = {
-    "hexahedron": "hex8",
-    "hexahedron20": "hex20",
-    "hexahedron27": "hex27",
-    "tetra": "tet4",
-    "tetra10": "tet10",
-    "wedge": "prism6",
-    "wedge15": "prism15",
-    "wedge18": "prism18",
-    "triangle": "tri3",
-    "quad": "quad4",
-}
 #: Where xx, yy, zz, yz, xz, xy stand among VTK's six components, and among nine row by row.
 _VOIGT = {6: [0, 1, 2, 4, 5, 3], 9: [0, 4, 8, 5, 2, 1]}
-_COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")
+
+
+#: States whose stress and strain are compared with the displacement.
+COMPARED = 3
 
 
 class _ExternalSection(Section):
@@ -50,15 +45,29 @@ class _ExternalSection(Section):
     table), a column ``step`` picks one of an XDMF series, and every other column is a parameter, its unit in
     brackets in the header, ``angle [deg]``. Files hold the undeformed mesh, coordinates and displacements in
     ``length_unit``, and point data by the names given here; ``stress`` (Cauchy, in ``stress_unit``) and
-    ``strain`` (Green-Lagrange) have six components in VTK's order xx, yy, zz, xy, yz, xz, or nine.
+    ``strain`` (Green-Lagrange) have six components in VTK's order xx, yy, zz, xy, yz, xz, or nine. ``defaults``
+    has texts such as "0.85 MPa" by parameter; the default of every other is the value in its range nearest to zero.
+    ``reactions`` names what each support exerts on the object: point data of forces (in ``force_unit``), which are
+    summed up, or three columns of the table, the force along x, y and z, or six with its moment about the origin.
     """
 
     table: StudyPath
     length_unit: LengthUnit
     displacement: str = "displacement"
     stress: str | None = None
-    stress_unit: StressUnit = "Pa"
+    stress_unit: StressUnit | None = None
     strain: str | None = None
+    defaults: dict[str, str] = Field(default_factory=dict)
+    reactions: dict[str, str | tuple[str, ...]] = Field(default_factory=dict)
+    force_unit: Literal["N", "mN", "kN"] | None = None
+
+    @model_validator(mode="after")
+    def _check_units(self) -> _ExternalSection:
+        if self.stress is not None and self.stress_unit is None:
+            raise ValueError('stress_unit is missing: say the unit of the stress, as stress_unit = "MPa"')
+        if self.force_unit is None and any(isinstance(source, str) for source in self.reactions.values()):
+            raise ValueError('force_unit is missing: say the unit of forces at points, as force_unit = "N"')
+        return self
 
 
 class _HoldOutSection(Section):
@@ -82,34 +91,88 @@ class ExternalStudy(Section):
         Raises
         ------
         StudyError
-            If the table or a file cannot be read, lacks something, or has another mesh than the first.
+            If the table or a file cannot be read, lacks something, has another mesh than the first, or stress or strain
+            that cannot be those of the displacement.
         """
-        parameters, coordinates, rows = read_table(self.external.table)
+        section = self.external
+        table, parameters, coordinates, outputs = self._table()
+        acting = [PointForces(name, key) for name, key in section.reactions.items() if isinstance(key, str)]
         snapshots: list[Snapshot] = []
-        mesh: Mesh | None = None
-        for row, point in zip(rows, coordinates, strict=True):
-            path = self.external.table.parent / row["file"]
+        first: Mesh | None = None
+        for number, (row, point) in enumerate(zip(table.rows, coordinates, strict=True)):
+            path = table.path.parent / row["file"]
             if not path.is_file():
                 raise StudyError(f"the solution {path} that the table names does not exist")
-            content = read_solution(path, row.get("step"))
-            here = _mesh(content, to_si(1.0, self.external.length_unit, "length"), path)
-            if mesh is None:
-                check_unit(here, self.external.length_unit, "external.length_unit")
-                mesh = here
-            _check_same(mesh, here, path)
-            snapshots.append(Snapshot(point, self._fields(content, path)))
-        assert mesh is not None
-        return model_mesh_of(mesh), parameters, snapshots
+            content = read_solution(path, row.get("step") or None)
+            here = mesh_of(content, section.length_unit, path)
+            if first is None:
+                first, used = here, used_nodes(here)
+                made = model_mesh_of(announced_mesh(here, section.length_unit, path))
+            check_same(first, here, path)
+            exerted = {name: values[number] for name, values in outputs.items()}
+            for forces in acting:
+                values = to_si(1.0, section.force_unit or "N", "force") * point_data(content, forces.data, (3,), path)
+                exerted |= forces.take(first.nodes + self._displacement(content, path), values)
+            snapshots.append(Snapshot(point, self._fields(content, path, used), outputs=exerted))
+        self._check_tensors(made, table, snapshots)
+        if section.reactions:
+            made = replace(made, supports={forces.name: forces.held(used) for forces in acting})
+            snapshots = as_fields(made, snapshots, section.reactions)
+        return made, parameters, snapshots
 
-    def _fields(self, content: meshio.Mesh, path: Path) -> dict[str, Array]:
+    def _check_tensors(self, mesh: ModelMesh, table: SolutionTable, snapshots: Sequence[Snapshot]) -> None:
+        """Compare stress and strain of the largest displacements with these."""
+        if not mesh.cells:
+            return
+        sizes = [-float(np.linalg.norm(snapshot.fields["displacement"])) for snapshot in snapshots]
+        chosen = np.argsort(sizes)[:COMPARED].tolist()
+        moves = [snapshots[index].fields["displacement"] for index in chosen]
+        file = table.path.parent / table.rows[chosen[0]]["file"]
+        checks = (("strain", self.external.strain, check_strain), ("stress_solid", self.external.stress, check_stress))
+        for name, key, check in checks:
+            if key is not None:
+                check(mesh, moves, [snapshots[index].fields[name] for index in chosen], f"{file}: '{key}'")
+
+    def _table(self) -> tuple[SolutionTable, tuple[Parameter, ...], Array, dict[str, Array]]:
+        """The table, its parameters, their values (n, d), and reactions (n, 3) that are columns of it."""
+        table, headers, outputs = SolutionTable(self.external.table), list[str](), dict[str, Array]()
+        for name, columns in self.external.reactions.items():
+            if not isinstance(columns, str):
+                found, parts = columns_of(table, name, columns)
+                headers += found
+                outputs |= parts
+        return table, *table.parameters(headers, self.external.defaults), outputs
+
+    def _displacement(self, content: meshio.Mesh, path: Path, used: NDArray[np.bool_] | None = None) -> Array:
+        """Of nodes used, or of all: (n, 3), m."""
+        length = to_si(1.0, self.external.length_unit, "length")
+        return length * point_data(content, self.external.displacement, (3,), path, used)
+
+    def _fields(self, content: meshio.Mesh, path: Path, used: NDArray[np.bool_]) -> dict[str, Array]:
         section = self.external
-        length, stress = to_si(1.0, section.length_unit, "length"), to_si(1.0, section.stress_unit, "stress")
-        fields = {"displacement": length * point_data(content, section.displacement, (3,), path)}
+        fields, stress = {"displacement": self._displacement(content, path, used)}, 1.0
+        if section.stress_unit is not None:
+            stress = to_si(stress, section.stress_unit, "stress")
         for name, key, factor in (("stress_solid", section.stress, stress), ("strain", section.strain, 1.0)):
             if key is not None:
-                values = point_data(content, key, tuple(_VOIGT), path)
+                values = point_data(content, key, tuple(_VOIGT), path, used)
                 fields[name] = factor * values[:, _VOIGT[values.shape[1]]]
         return fields
+
+    def doubts(self, snapshots: Sequence[Snapshot]) -> list[str]:
+        """Sentences on solutions that the others contradict, and on where the box of parameters is empty."""
+        table, _, coordinates, _ = self._table()
+        places = {
+            point.tobytes(): f"{table.path.name}, line {line}, '{row['file']}'"
+            for point, line, row in zip(coordinates, table.lines, table.rows, strict=True)
+        }
+        # In the order of the table, as sentences are.
+        snapshots = sorted(snapshots, key=lambda snapshot: list(places).index(snapshot.coordinates.tobytes()))
+        grams = {}
+        for name in snapshots[0].fields:
+            values = np.array([snapshot.fields[name].ravel() for snapshot in snapshots])
+            grams[name] = values @ values.T
+        return doubts(coordinates, grams, list(places.values()))
 
     def split(self, count: int) -> tuple[list[int], list[int]]:
         """Training and held-out solutions, by index."""
@@ -121,80 +184,3 @@ class ExternalStudy(Section):
             )
         order = np.random.default_rng(self.sampling.seed).permutation(count)
         return sorted(order[held_out:].tolist()), sorted(order[:held_out].tolist())
-
-
-def read_table(path: Path) -> tuple[tuple[Parameter, ...], Array, list[dict[str, str]]]:
-    """The parameter table: parameters, their values (n, d) in SI, and the rows."""
-    (_, header), *lines = read_csv(path, "table", StudyError) or [(1, [])]
-    rows = [dict(zip(header, cells + [""] * len(header), strict=False)) for _, cells in lines]
-    if "file" not in header or not rows:
-        raise StudyError(f"{path} needs a column 'file' and a row for each solution")
-    _check_listed_once(path, rows)
-    columns = [_column(path, name) for name in header if name not in ("file", "step")]
-    if not columns:
-        raise StudyError(f"{path} has no parameter: add a column such as 'angle [deg]'")
-    values = np.array([[_number(path, n, row, key) for key, _, _ in columns] for n, row in enumerate(rows, 2)])
-    parameters = []
-    for (_, name, unit), column in zip(columns, values.T, strict=True):
-        quantity = quantity_of(unit)
-        column *= to_si(1.0, unit, quantity)
-        lower, upper = float(column.min()), float(column.max())
-        if not lower < upper:
-            raise StudyError(f"{path}: the parameter {name} is the same in all rows; leave the column out")
-        parameters.append(Parameter(name, quantity, unit, lower, upper, min(max(0.0, lower), upper)))
-    return tuple(parameters), values, rows
-
-
-def _check_listed_once(path: Path, rows: list[dict[str, str]]) -> None:
-    """One solution has one set of parameters."""
-    lines: dict[tuple[str | None, str | None], int] = {}
-    for line, row in enumerate(rows, 2):
-        solution = (row.get("file"), row.get("step"))
-        if solution in lines:
-            raise StudyError(
-                f"{path}, line {line}: '{solution[0]}' is in line {lines[solution]} already; list each solution once"
-            )
-        lines[solution] = line
-
-
-def _column(path: Path, header: str) -> tuple[str, str, str]:
-    """Header, name and unit of a parameter's column."""
-    match = _COLUMN.fullmatch(header)
-    if match is None:
-        raise StudyError(f"{path}: '{header}' is no parameter's header; write 'angle [deg]' for example")
-    return header, match["name"], match["unit"] or "1"
-
-
-def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
-    try:
-        return float(row[key])
-    except (TypeError, ValueError):
-        raise StudyError(f"{path}, line {line}: '{row.get(key)}' is no number for {key}") from None
-
-
-def _mesh(content: meshio.Mesh, unit: float, path: Path) -> Mesh:
-    """The cells of the highest dimension; other types are an error."""
-    blocks = [block for block in content.cells if block.type not in ("vertex", "line")]
-    unknown = {block.type for block in blocks} - set(_CELL_TYPES)
-    if unknown or not blocks:
-        raise StudyError(
-            f"{path} has {'cells of type ' + ', '.join(sorted(unknown)) if unknown else 'no cells'}; "
-            f"known are {', '.join(_CELL_TYPES)}"
-        )
-    made = [CellBlock(_CELL_TYPES[block.type], np.asarray(block.data, dtype=np.int64)) for block in blocks]
-    highest = max(block.type.dimension for block in made)
-    nodes = np.zeros((len(content.points), 3))
-    nodes[:, : content.points.shape[1]] = content.points
-    return Mesh(unit * nodes, tuple(block for block in made if block.type.dimension == highest))
-
-
-def _check_same(first: Mesh, other: Mesh, path: Path) -> None:
-    same = len(first.blocks) == len(other.blocks) and first.nodes.shape == other.nodes.shape
-    same = same and all(
-        np.array_equal(a.connectivity, b.connectivity) for a, b in zip(first.blocks, other.blocks, strict=True)
-    )
-    if not same or np.abs(first.nodes - other.nodes).max() > SAME * np.ptp(first.nodes, axis=0).max():
-        raise StudyError(
-            f"{path} has another mesh than the first solution: all need the same undeformed nodes and cells, "
-            "with the displacement as point data"
-        )

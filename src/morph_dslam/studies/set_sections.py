@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -11,9 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from morph_dslam.errors import StudyError
+from morph_dslam.meshing.hollows import hollow_wall
 from morph_dslam.meshing.mesh_summary import unit_normals
 from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.studies.sections import JOINED, Angle, Length, Number, PositiveLength, Section, SetName
+from morph_dslam.studies.solid_sections import mesh_fingerprint
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -29,8 +32,9 @@ class SetSection(Section):
 
     A ``box`` is given by two opposite corners, a ball by the point ``near`` which it is and its ``radius``. ``facing``
     leaves the faces whose outward normal is at most ``angle`` (45 degrees if absent) from a direction, ``of`` those of
-    a surface, or of several listed (of shells: cell sets); then the nodes are those of the faces. All that is given
-    holds together. ``nearest`` alone is the one node nearest to a point.
+    a surface, or of several listed (of shells: cell sets), ``hollow`` the wall of the hollow of a solid, closed or
+    with an inlet, that a point lies in; then the nodes are those of the faces. All that is given holds together.
+    ``nearest`` alone is the one node nearest to a point.
     """
 
     box: tuple[tuple[Length, Length, Length], tuple[Length, Length, Length]] | None = None
@@ -39,13 +43,14 @@ class SetSection(Section):
     facing: tuple[Number, Number, Number] | None = None
     angle: Annotated[Angle, Field(gt=0.0, le=np.pi)] | None = None
     of: SetName | None = None
+    hollow: tuple[Length, Length, Length] | None = None
     nearest: tuple[Length, Length, Length] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> SetSection:
-        regions = (self.box, self.near, self.facing, self.of)
+        regions = (self.box, self.near, self.facing, self.of, self.hollow)
         if (self.nearest is None) == all(region is None for region in regions):
-            raise ValueError("give either nearest, or a region: any of box, near with radius, facing, of")
+            raise ValueError("give either nearest, or a region: any of box, near with radius, facing, of, hollow")
         if (self.near is None) != (self.radius is None):
             raise ValueError("near and radius belong together: give both, or neither")
         if self.angle is not None and self.facing is None:
@@ -57,7 +62,7 @@ class SetSection(Section):
     @property
     def chooses_faces(self) -> bool:
         """Whether it is made of faces, not of all that lies in a part of space."""
-        return self.facing is not None or self.of is not None
+        return any(given is not None for given in (self.facing, self.of, self.hollow))
 
     def holds(self, points: Array, length: float) -> Mask:
         """Which of some points (n, 3), metres, lie in box and ball; ``length`` is the mesh's."""
@@ -96,6 +101,9 @@ class SetSection(Section):
         else:
             faces = np.unique(np.concatenate([_faces_named(mesh, part) for part in self.of.split(JOINED)]), axis=0)
         faces = mesh.faces_within(faces, inside)
+        if self.hollow is not None:
+            wall = {tuple(face) for face in _wall_around(mesh, self.hollow).tolist()}
+            faces = faces[[tuple(face) in wall for face in faces.tolist()]]
         if self.facing is None or not len(faces):
             return faces
         direction = np.array(self.facing) / np.linalg.norm(self.facing)
@@ -135,6 +143,26 @@ def with_sets(mesh: Mesh, sets: Mapping[str, SetSection]) -> Mesh:
 def _faces_named(mesh: Mesh, name: str) -> Indices:
     """Faces (f, 2) of a surface, of sheets those of a cell set. Raises StudyError if there is none of this name."""
     return faces_of_cells(mesh.cells(name)) if mesh.is_sheet else mesh.faces_in(name)
+
+
+@dataclass(frozen=True)
+class _Body:
+    """A mesh that is compared by its nodes and cells alone."""
+
+    fingerprint: str
+    mesh: Mesh = field(compare=False)
+
+
+def _wall_around(mesh: Mesh, point: tuple[float, float, float]) -> Indices:
+    """`hollow_wall`, found once for each body; StudyError for sheets, too."""
+    if mesh.is_sheet:
+        raise StudyError("hollow is for solids: choose the cells of a shell by box, near, facing or of")
+    return _found_wall(_Body(mesh_fingerprint(Mesh(mesh.nodes, mesh.blocks)), mesh), point)
+
+
+@lru_cache(maxsize=16)
+def _found_wall(body: _Body, point: tuple[float, float, float]) -> Indices:
+    return hollow_wall(body.mesh, np.array(point))
 
 
 def _nearest(nodes: Array, point: Array, length: float) -> Indices:

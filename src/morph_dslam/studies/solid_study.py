@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from morph_dslam.studies.body_study import (
     reader_of,
     with_named_sets,
 )
+from morph_dslam.studies.load_sizes import load_doubt
 from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.moving_loads import check_reach, check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
@@ -51,6 +52,7 @@ from morph_dslam.studies.solid_sections import (
 )
 from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep, loadable
 
+Indices = NDArray[np.int64]
 #: `SolidOptions.mixed` by the name of a formulation.
 MIXED = {"automatic": None, "displacement": False, "mixed": True}
 #: More increments of time than these in a solve are a mistake in the unit of a step.
@@ -190,6 +192,11 @@ class SolidStudy(BodyStudy, Section):
         """See `BodyStudy`; the time needs not be named."""
         super().check_parameters_used([*elsewhere, self.time.parameter] if self.time else elsewhere)
 
+    @property
+    def advice(self) -> str:
+        """See `BodyStudy`; before it, loads that are too large for the materials by far."""
+        return load_doubt(self.loads, self.materials.values(), self.model_parameters()) + super().advice
+
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
     @property
@@ -201,8 +208,8 @@ class SolidStudy(BodyStudy, Section):
         """The mesh with the sets of the study, checked together with those that it names."""
         return with_named_sets(with_sets(make_mesh(self.mesh), self.sets), self._sets())
 
-    def _sets(self) -> Iterator[NamedSet]:
-        """The sets that the study names."""
+    def _sets(self, unknown: bool = True) -> Iterator[NamedSet]:
+        """The sets that the study names, without that of ``unknown`` loads where it shall be left out."""
         for name, material in self.materials.items():
             yield f"materials.{name}.on", material.on, "cells"
         for where, section in self._listed():
@@ -211,7 +218,7 @@ class SolidStudy(BodyStudy, Section):
             for key in ("on", "against", "kept"):
                 if name := getattr(section, key, None):
                     yield f"{where}: {key}", name, what
-        if self.unknown_loads:
+        if self.unknown_loads and unknown:
             yield "unknown_loads.on", self.unknown_loads.on, "surface"
 
     def fingerprint(self) -> str:
@@ -225,7 +232,7 @@ class SolidStudy(BodyStudy, Section):
         content["root"] = self.root().tolist() if self.time else None
         content["time"] = self.time.model_dump(exclude_none=True) if self.time else None
         mesh = self.solid_mesh()
-        content["mesh"] = mesh_fingerprint(mesh)
+        content["mesh"] = mesh_fingerprint(self._solved(mesh))
         content["code"] = SOLVER_VERSION
         content |= {"shape": shape_fingerprints(self.shape, mesh)} if self.shape else {}
         content |= self.model_dump(mode="json", include={"couplings"}) if self.couplings else {}
@@ -236,6 +243,25 @@ class SolidStudy(BodyStudy, Section):
             if section["kind"] == "mesh":
                 section["file"] = hashlib.sha256(Path(section["file"]).read_bytes()).hexdigest()
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def _solved(self, mesh: Mesh) -> Mesh:
+        """The mesh with the sets that solutions may depend on: its own, and those of the study that mechanics names.
+
+        Others, and the surface of unknown loads, change no solution, so that whoever adds them keeps what is solved.
+        """
+        named = {name for _, name, _ in self._sets(unknown=False)}
+        named |= {part.centre for part in self.supports if part.kind == "rotation" and isinstance(part.centre, str)}
+        own = make_mesh(self.mesh)
+
+        def kept(sets: Mapping[str, Indices], among: Iterable[str]) -> dict[str, Indices]:
+            return {name: members for name, members in sets.items() if name in {*named, *among}}
+
+        return replace(
+            mesh,
+            node_sets=kept(mesh.node_sets, own.node_sets),
+            cell_sets=kept(mesh.cell_sets, own.cell_sets),
+            surfaces=kept(mesh.surfaces, {*own.surfaces} - own.found),
+        )
 
     def problem(self, options: SolidOptions | None = None) -> SolidProblem:
         """The discretised solid, with the study's own elements if ``options`` name no others."""
@@ -269,7 +295,7 @@ class SolidStudy(BodyStudy, Section):
             )
         return problem
 
-    def obstacles(self) -> tuple[ParameterSymbols, list[tuple[RigidObstacle, NDArray[np.int64]]]]:
+    def obstacles(self) -> tuple[ParameterSymbols, list[tuple[RigidObstacle, Indices]]]:
         """What its contacts keep the solid out of, with the nodes that they name, and the symbols of its place."""
         symbols, mesh = ParameterSymbols(self.model_parameters()), self.solid_mesh()
         rigid = [section.make(reader_of(symbols)) for section in self.contacts if section.kind != "surface"]

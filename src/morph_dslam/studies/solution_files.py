@@ -22,8 +22,10 @@ SAME = 1e-5
 def read_solution(path: Path, step: str | None = None) -> meshio.Mesh:
     """A file's mesh and point data; of an XDMF series those of one step.
 
-    Raises StudyError if it is missing, damaged or of another kind.
+    Raises StudyError if it is missing, damaged or of another kind, or the step is no number from 0 on.
     """
+    if step is not None and not step.isdecimal():
+        raise StudyError(f"step '{step}' of {path} is no whole number from 0 on")
     read = _READERS.get(file_kind(path))
     if read is None:
         raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
@@ -38,9 +40,34 @@ def read_solution(path: Path, step: str | None = None) -> meshio.Mesh:
         raise StudyError(f"cannot read the solution {path}: {error}") from error
 
 
-def point_data(content: meshio.Mesh, name: str, widths: tuple[int, ...], path: Path) -> Array:
-    """Point data (n, c) with one of the given numbers of components; StudyError if there are none, or not finite."""
+def point_data(
+    content: meshio.Mesh, name: str, widths: tuple[int, ...], path: Path, used: NDArray[np.bool_] | None = None
+) -> Array:
+    """Point data by its name.
+
+    Parameters
+    ----------
+    content : of the file.
+    name : of the data.
+    widths : numbers of components that it may have.
+    path : of the file, for messages.
+    used : (n,) nodes to take; all if absent.
+
+    Returns
+    -------
+    (m, c) values at the nodes taken.
+
+    Raises
+    ------
+    StudyError
+        If there is none of the name, or it has other components or, at nodes taken, values that are not finite.
+    """
     if name not in content.point_data:
+        if name in content.cell_data:
+            raise StudyError(
+                f"{path} has '{name}' as cell data, and values at the points are needed: average it to the points "
+                "(ParaView: the filter Cell Data to Point Data)"
+            )
         known = ", ".join(content.point_data) or "none"
         raise StudyError(f"{path} has no point data '{name}'; it has: {known}")
     values: Any = np.asarray(content.point_data[name], dtype=np.float64)
@@ -48,6 +75,7 @@ def point_data(content: meshio.Mesh, name: str, widths: tuple[int, ...], path: P
     if values.shape[1] not in widths:
         wanted = " or ".join(str(width) for width in widths)
         raise StudyError(f"{path}: '{name}' has {values.shape[1]} components in place of {wanted}")
+    values = values if used is None else values[used]
     if not np.isfinite(values).all():
         raise StudyError(f"{path}: '{name}' holds values that are not finite")
     return values

@@ -30,15 +30,21 @@ from morph_dslam.units import to_si
 Study = SheetStudy | ShellStudy | SolidStudy | ExternalStudy
 
 
+def study_file(path: str | Path) -> Path:
+    """The file of a study that is named by its file, or by the folder of a file study.toml."""
+    path = Path(path)
+    return path / "study.toml" if path.is_dir() else path
+
+
 def load_study(path: str | Path) -> Study:
-    """Read a study file; paths in it are relative to it.
+    """Read a study file, or the file study.toml of a folder; paths in it are relative to it.
 
     Raises
     ------
     StudyError
         If it is missing, is not TOML, has an unknown or missing key, or a value that cannot be.
     """
-    path = Path(path)
+    path = study_file(path)
     return make_study(read_toml(path, "study file", StudyError), path.parent, str(path))
 
 

@@ -1,0 +1,120 @@
+"""Meshes of another program's solutions: read, checked, and compared from file to file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from morph_dslam.errors import StudyError
+from morph_dslam.meshing.mesh_checks import check_mesh, wrong_cells
+from morph_dslam.meshing.mesh_summary import described_mesh
+from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.studies.problem import announce
+from morph_dslam.studies.solid_sections import check_unit
+from morph_dslam.studies.solution_files import SAME
+from morph_dslam.units import to_si
+
+#: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
+_CELL_TYPES = {
+    "hexahedron": "hex8",
+    "hexahedron20": "hex20",
+    "hexahedron27": "hex27",
+    "tetra": "tet4",
+    "tetra10": "tet10",
+    "wedge": "prism6",
+    "wedge15": "prism15",
+    "wedge18": "prism18",
+    "triangle": "tri3",
+    "quad": "quad4",
+}
+
+
+def mesh_of(content: meshio.Mesh, unit: str, path: Path) -> Mesh:
+    """All points and the cells of the highest dimension, metres; StudyError if there are none or other types."""
+    blocks = [block for block in content.cells if block.type not in ("vertex", "line")]
+    unknown = {block.type for block in blocks} - set(_CELL_TYPES)
+    if unknown or not blocks:
+        raise StudyError(
+            f"{path} has {'cells of type ' + ', '.join(sorted(unknown)) if unknown else 'no cells'}; "
+            f"known are {', '.join(_CELL_TYPES)}"
+        )
+    made = [CellBlock(_CELL_TYPES[block.type], np.asarray(block.data, dtype=np.int64)) for block in blocks]
+    highest = max(block.type.dimension for block in made)
+    nodes = np.zeros((len(content.points), 3))
+    nodes[:, : content.points.shape[1]] = content.points
+    return Mesh(to_si(1.0, unit, "length") * nodes, tuple(block for block in made if block.type.dimension == highest))
+
+
+def used_nodes(mesh: Mesh) -> NDArray[np.bool_]:
+    """Which nodes (n,) belong to cells."""
+    used = np.zeros(mesh.n_nodes, dtype=bool)
+    for block in mesh.blocks:
+        used[block.connectivity] = True
+    return used
+
+
+def announced_mesh(mesh: Mesh, unit: str, path: Path) -> Mesh:
+    """The mesh of the first solution without unused nodes, checked and printed: a wrong unit shows in its size.
+
+    Raises StudyError naming the file, or the key of the unit, if it is wrong.
+    """
+    mesh = mesh.without_unused_nodes()
+    check_unit(mesh, unit, "external.length_unit")
+    try:
+        for part in _parts(mesh):
+            _check_order(part)
+            check_mesh(part)
+    except StudyError as error:
+        raise StudyError(f"{path}: {error}") from error
+    announce(f"mesh: {described_mesh(mesh)}")
+    return mesh
+
+
+def _check_order(mesh: Mesh) -> None:
+    """Refuse cells all of which are folded: their nodes are in another order."""
+    found = wrong_cells(mesh)
+    if found is not None and len(found.bad) == found.count and not (found.mirrored or found.flat):
+        raise StudyError(
+            f"all {found.count} {found.cell_type} cells are inverted or folded: their nodes are listed in another "
+            "order than VTK's (that of CalculiX's .frd files has other middle nodes of hex20 cells, say)"
+        )
+
+
+def _parts(mesh: Mesh) -> list[Mesh]:
+    """The parts of a mesh that share no node, each by itself: other programs tie them, or let them touch."""
+    joined = [block.connectivity for block in mesh.blocks]
+    ends = [np.stack(np.broadcast_arrays(cells[:, :1], cells)).reshape(2, -1) for cells in joined]
+    row, column = np.concatenate(ends, axis=1)
+    links = coo_array((np.ones(len(row)), (row, column)), shape=(mesh.n_nodes, mesh.n_nodes))
+    count, part = connected_components(links, directed=False)
+    if count == 1:
+        return [mesh]
+    return [
+        Mesh(
+            mesh.nodes,
+            tuple(
+                CellBlock(block.cell_type, cells)
+                for block in mesh.blocks
+                if len(cells := block.connectivity[part[block.connectivity[:, 0]] == number])
+            ),
+        ).without_unused_nodes()
+        for number in range(count)
+    ]
+
+
+def check_same(first: Mesh, other: Mesh, path: Path) -> None:
+    """Refuse a solution that is not on the mesh of the first (StudyError)."""
+    same = len(first.blocks) == len(other.blocks) and first.nodes.shape == other.nodes.shape
+    same = same and all(
+        np.array_equal(a.connectivity, b.connectivity) for a, b in zip(first.blocks, other.blocks, strict=True)
+    )
+    if not same or np.abs(first.nodes - other.nodes).max() > SAME * np.ptp(first.nodes, axis=0).max():
+        raise StudyError(
+            f"{path} has another mesh than the first solution: all need the same undeformed nodes and cells, "
+            "with the displacement as point data"
+        )

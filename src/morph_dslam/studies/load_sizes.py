@@ -1,0 +1,69 @@
+"""Whether loads on surfaces go with the stiffness of a solid: what a message on solutions that failed may add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from morph_dslam.mechanics.materials.base import Material, isotropic_average
+from morph_dslam.model import Parameter
+from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.body_study import numbered
+from morph_dslam.studies.solid_sections import Value
+
+#: Loads of more than so many shear moduli carry no rubber's shape any more: their unit is probably wrong.
+MOST_MODULI = 20.0
+
+
+def load_doubt(loads: Iterable[Any], materials: Iterable[Any], parameters: Sequence[Parameter]) -> str:
+    """A sentence on the first pressure or traction that is far too large for the stiffest material; else "".
+
+    Parameters
+    ----------
+    loads, materials : sections of a study.
+    parameters : that they may name; materials count at the defaults, loads where the ranges make them largest.
+    """
+    shear = max(_shear_modulus(section, parameters) for section in materials)
+    for where, section in numbered("load", loads):
+        largest = _largest_stress(section, parameters)
+        if largest > MOST_MODULI * shear:
+            return (
+                f"{where.capitalize()} reaches {_shown(largest)}, {largest / shear:.0f} times the shear modulus of the "
+                f"stiffest material ({_shown(shear)}): is its unit right? "
+            )
+    return ""
+
+
+def _shear_modulus(section: Any, parameters: Sequence[Parameter]) -> float:
+    """Of a material at small strain, Pa."""
+    defaults = np.array([parameter.default for parameter in parameters])
+
+    def read(value: Value, quantity: str | None) -> float:
+        return read_affine(value, quantity, parameters)(defaults)
+
+    made = section.make(read)
+    assert isinstance(made, Material)
+    return isotropic_average(made.small_strain_stiffness())[1]
+
+
+def _largest_stress(section: Any, parameters: Sequence[Parameter]) -> float:
+    """The largest pressure, or component of a traction, anywhere in the ranges of the parameters, Pa."""
+    ends = np.array([[parameter.lower, parameter.upper] for parameter in parameters])
+    largest = [0.0]
+
+    def read(value: Value, quantity: str | None) -> float:
+        found = read_affine(value, quantity, parameters)
+        if quantity in ("pressure", "stress"):
+            terms = np.array(found.slopes)[:, None] * ends
+            sums = found.constant + np.array([terms.min(axis=1).sum(), terms.max(axis=1).sum()])
+            largest.append(float(np.abs(sums).max()))
+        return found.constant
+
+    section.make(read)
+    return max(largest)
+
+
+def _shown(stress: float) -> str:
+    return f"{1e-6 * stress:.3g} MPa" if stress >= 1e6 else f"{1e-3 * stress:.3g} kPa"
