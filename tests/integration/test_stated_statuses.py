@@ -1,5 +1,6 @@
 """What is not as it should be leads to a stated status, never to a confident wrong answer."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import UnusualSize, WrongUnit
+from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain, OtherReferenceView
 from tests.support.staged_scenes import SCENES, aside, drawn_out, is_beyond, is_doubted
 from tests.support.stated_cases import (
@@ -174,12 +176,13 @@ def test_one_that_is_there_instead_is_found_only_if_it_has_the_print(sheet, like
 def test_wrong_and_confident_are_measured_as_stated(solid):
     """The measure itself: the truth shifted by 6 mm is wrong; what says that it does not know is not."""
     truth = solid.state(0.2)
-    estimate = SimpleNamespace(state=truth, covariance=1e-10 * np.eye(8))
+    estimate = Estimate(truth, 0.0, np.empty((0, 2)), 0.1, 1e-10 * np.eye(8), np.zeros(2, dtype=bool), 1, True)
     result = SimpleNamespace(status="tracked", estimate=estimate)
     assert not is_beyond(solid.model, result, solid.model, truth)
-    estimate.state = aside(truth, [6e-3, 0.0, 0.0])
+    result.estimate = replace(estimate, state=aside(truth, [6e-3, 0.0, 0.0]))
     assert is_beyond(solid.model, result, solid.model, truth)
-    estimate.covariance = np.diag([0, 0, 0, 0, 0, 5e-6, 0, 0.0])  # 2.2 mm
+    in_doubt = np.diag([0, 0, 0, 0, 0, 5e-6, 0, 0.0])  # 2.2 mm
+    result.estimate = replace(result.estimate, covariance=in_doubt)
     assert not is_beyond(solid.model, result, solid.model, truth)
     result.warnings = (OtherReferenceView(1),)
     assert not is_doubted(result)
