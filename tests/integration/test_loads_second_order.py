@@ -1,4 +1,4 @@
-"""Unknown loads on a slender beam: it bends far, and gets no longer by it."""
+"""Unknown loads on slender bodies: they bend far, and get no longer by it."""
 
 from __future__ import annotations
 
@@ -76,6 +76,26 @@ def test_a_bent_beam_keeps_its_length(loaded):
     moved = loaded.displacement.value(uniform(loaded, 0.0, [0.0, 0.0, -0.5 * TRACTION]))[end].mean(axis=0)
     assert moved[2] == pytest.approx(-LENGTH / 12.0, rel=0.03)
     assert moved[0] == pytest.approx(-0.6 * moved[2] ** 2 / LENGTH, rel=0.06)
+
+
+def test_a_strip_that_bends_under_an_even_load_keeps_its_length():
+    """A cantilever under an even load whose end moves by v is 4 v^2 / 7 L shorter along its axis."""
+    study = {
+        "name": "strip",
+        "mesh": {"generator": "plate", "size": ["80 mm", "10 mm"], "divisions": [12, 2]},
+        "shell": {"thickness": "1 mm"},
+        "material": {"young": "1 MPa", "poisson": 0.3},
+        "supports": [{"kind": "clamped", "on": "x_min"}],
+        "loads": [{"kind": "traction", "traction": ["0 Pa", "0 Pa", "down"]}],
+        "parameters": {"down": {"range": ["-0.5 Pa", "0.5 Pa"], "default": "0 Pa"}},
+        "sampling": {"scheme": "even", "training": 8, "held_out": 4, "refined": 0},
+        "unknown_loads": {"direction": "any", "modes": 24},
+    }
+    loaded = with_unknown_loads(build(make_study(study)), 1e-4)
+    end = np.flatnonzero(loaded.nodes[:, 0] > LENGTH - 1e-9)
+    moved = loaded.displacement.value(uniform(loaded, 0.0, [0.0, 0.0, -0.2]))[end].mean(axis=0)
+    assert 0.1 * LENGTH < -moved[2] < 0.2 * LENGTH
+    assert moved[0] == pytest.approx(-4.0 / 7.0 * moved[2] ** 2 / LENGTH, rel=0.02)
 
 
 def test_derivatives_agree_with_differences(loaded):
