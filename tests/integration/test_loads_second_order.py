@@ -9,6 +9,8 @@ import pytest
 
 from morph_dslam import Parameter, SolidProblem, build, load_model, make_study
 from morph_dslam.extend.mechanics import DeadTraction, ParameterSymbols, advance, fixed
+from morph_dslam.model.model_errors import ModelErrors
+from morph_dslam.model.parameter_errors import parameter_errors
 from morph_dslam.model.storage import save_model
 from morph_dslam.model.unknown_loads import with_unknown_loads
 
@@ -115,3 +117,33 @@ def test_a_model_file_keeps_it_and_is_checked(file, tmp_path):
     short = replace(model.unknown_loads, second_order=replace(second, soft=second.soft[:2]))
     with pytest.raises(ValueError, match="second order"):
         save_model(tmp_path / "wrong.morph", replace(model, unknown_loads=short))
+
+
+def test_what_the_mesh_is_off_by_is_a_deviation_of_unknown_loads(loaded):
+    """Finer elements that are off as under a force of 1 mN on the end: deviations hold it, also where it is pushed."""
+    model, count = loaded.energy.model, loaded.n_loads
+    force = uniform(loaded, 0.0, [0.0, 0.0, -1e-3 / WIDTH**2])[1:]
+    mu = np.array([50.0])
+    own = model.displacement.value(mu)
+    _, slopes = loaded.displacement.value_and_sensitivities(np.append(mu, np.zeros(count)))
+    entry = parameter_errors(model, [(mu, own, own + np.tensordot(force, slopes[1:], axes=1))])
+    assert entry["left_rms_mm"][0] > 10.0 * entry["with_unknown_loads"]["left_rms_mm"][0]
+    certified = replace(model, certificate={"discretisation": {"parameters": entry}})
+    errors = ModelErrors.of(with_unknown_loads(certified, 1e-3))
+    assert errors is not None
+    resultant = loaded.energy.loads.resultants[:, 2]
+
+    def stated(coefficients):
+        covariance = errors.at(np.append(mu, coefficients)).parameters[1:, 1:]
+        return float(np.sqrt(resultant @ covariance @ resultant))
+
+    at_rest = stated(np.zeros(count))
+    # In proportion to the displacement of the surface: that of the finer elements is a little larger.
+    size = [
+        np.sqrt(np.mean(np.sum(moved[np.unique(model.triangles)] ** 2, axis=1)))
+        for moved in (own, own + np.tensordot(force, slopes[1:], axes=1))
+    ]
+    assert at_rest == pytest.approx(1e-3 * size[0] / size[1], rel=0.03)
+    # A load that pushes the end back takes nothing away.
+    back = uniform(loaded, 0.0, [0.0, -50.0, 0.0])[1:]
+    assert stated(back) > 1.3 * at_rest

@@ -42,7 +42,7 @@ class ModelErrors:
     mesh : by its discretisation, if that was estimated.
     reduction : by its reduction, if that is known.
     constant : (d,) which parameters are found from all frames together.
-    n_loads : unknown loads among the last parameters; they get nothing.
+    n_loads : unknown loads among the last parameters; the reduction adds nothing to them.
     """
 
     mesh: ParameterErrors | None

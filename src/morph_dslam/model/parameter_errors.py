@@ -16,16 +16,23 @@ from numpy.typing import NDArray
 
 from morph_dslam.model.functions import Functions
 from morph_dslam.model.reduced_model import ReducedModel
+from morph_dslam.model.unknown_loads import with_unknown_loads
 
 Array = NDArray[np.float64]
 #: The certificate's entries of these errors, within that of the discretisation.
 ENTRY, ERRORS, SIZES, LEFT = "parameters", "errors", "displacement_rms_mm", "left_rms_mm"
+#: Within the latter those of a model with its unknown loads, which take up what the parameters leave.
+WITH_LOADS = "with_unknown_loads"
+#: Unknown loads are found from a surface that is measured to this part of the object's extent, by many points.
+MEASURED = 1e-5
 #: Combinations of parameters that move the surface by less than this part of what others do are left out.
 LEAST_EFFECT = 1e-3
 
 
 def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> tuple[Array, float]:
     """Parameters' changes that move the surface most nearly as an error of the displacement does, and what is left.
+
+    Unknown loads among the parameters are as likely as their energy has it.
 
     Parameters
     ----------
@@ -41,7 +48,14 @@ def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> tuple[Arr
     nodes, ranges = np.unique(model.triangles), np.array([p.upper - p.lower for p in model.parameters])
     _, slopes = model.fields["displacement"].value_and_sensitivities(mu)
     effects = slopes[:, nodes].reshape(len(ranges), -1).T * ranges
-    changes = np.linalg.lstsq(effects, error[nodes].ravel(), rcond=LEAST_EFFECT)[0]
+    rows, wanted = effects, error[nodes].ravel()
+    if model.energy is not None:
+        extent = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+        root = np.linalg.cholesky(model.energy.loads.compliance(mu[: -model.n_loads]) / model.energy.work)
+        least = np.sqrt(len(nodes)) * MEASURED * extent * (root * ranges[-model.n_loads :, None]).T
+        rows = np.vstack([effects, np.hstack([np.zeros((len(least), len(ranges) - len(least))), least])])
+        wanted = np.append(wanted, np.zeros(len(least)))
+    changes = np.linalg.lstsq(rows, wanted, rcond=LEAST_EFFECT)[0]
     left = error[nodes] - (effects @ changes).reshape(-1, 3)
     return np.asarray(ranges * changes, dtype=np.float64), _rms(left)
 
@@ -59,8 +73,19 @@ def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, A
     -------
     dict
         "errors", by parameter, of each state, SI; "displacement_rms_mm" of the surface there; "left_rms_mm" of the
-        displacement's error that no change of the parameters makes good.
+        displacement's error that no change of the parameters makes good. Of a model that may have unknown loads,
+        "with_unknown_loads" is the same where these make it good too.
     """
+    found = _entry(model, states)
+    if model.unknown_loads is not None and model.energy is None:
+        none = np.zeros(model.unknown_loads.count)
+        found[WITH_LOADS] = _entry(
+            with_unknown_loads(model), [(np.append(mu, none), own, finer) for mu, own, finer in states]
+        )
+    return found
+
+
+def _entry(model: ReducedModel, states: Sequence[tuple[Array, Array, Array]]) -> dict[str, Any]:
     nodes = np.unique(model.triangles)
     matched = [equivalent_errors(model, mu, finer - own) for mu, own, finer in states]
     found = np.array([changes for changes, _ in matched])
@@ -87,12 +112,14 @@ class ParameterErrors:
     left_share : of that displacement, root mean square over the states: what no change of the parameters makes good.
     functions : of the displacement.
     products : (m, m) mean products of its modes on the surface, squared metres.
+    n_loads : unknown loads among the last parameters.
     """
 
     per_metre: Array
     left_share: float
     functions: Functions
     products: Array
+    n_loads: int = 0
 
     @classmethod
     def of(cls, model: ReducedModel) -> ParameterErrors | None:
@@ -100,6 +127,7 @@ class ParameterErrors:
         stated = model.certificate.get("discretisation", {}).get(ENTRY)
         if stated is None or not model.parameters:
             return None
+        stated = stated.get(WITH_LOADS, stated) if model.n_loads else stated
         sizes, none = 1e-3 * np.array(stated[SIZES]), [0.0] * len(stated[SIZES])
         left = 1e-3 * np.array(stated.get(LEFT, none))
         errors = np.array([stated[ERRORS].get(p.name, none) for p in model.parameters]).T
@@ -109,7 +137,8 @@ class ParameterErrors:
         nodes, field = np.unique(model.triangles), model.fields["displacement"]
         modes = field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
         share = float(np.sqrt(np.mean((left[moved] / sizes[moved]) ** 2)))
-        return cls(errors[moved] / sizes[moved, None], share, field.functions, modes @ modes.T / len(nodes))
+        products = modes @ modes.T / len(nodes)
+        return cls(errors[moved] / sizes[moved, None], share, field.functions, products, model.n_loads)
 
     def covariance(self, mu: Array) -> Array:
         """Covariance (d, d) of the parameters at a state ``mu`` (d,), SI."""
@@ -120,6 +149,12 @@ class ParameterErrors:
         return self.left_share * float(np.sqrt(self._squared(mu)))
 
     def _squared(self, mu: Array) -> float:
-        """Mean square displacement of the surface, squared metres."""
-        row = self.functions.rows(self.functions.nearest_inside(mu))[0]
-        return max(float(row @ self.products @ row), 0.0)
+        """Mean square displacement of the surface, squared metres.
+
+        Where unknown loads push back what the study's own have moved, the body is strained by both.
+        """
+        by_study = mu.copy()
+        by_study[len(mu) - self.n_loads :] = 0.0
+        rows = [self.functions.rows(self.functions.nearest_inside(state))[0].copy() for state in (by_study, mu)]
+        parts = (rows[0], rows[1] - rows[0])
+        return max(float(sum(row @ self.products @ row for row in parts)), 0.0)
