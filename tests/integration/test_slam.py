@@ -160,6 +160,16 @@ def test_the_camera_is_found_again_after_noise_darkness_and_a_standstill(room_fi
     assert frames[-1].pose.camera_from_world == pytest.approx(frames[49].pose.camera_from_world, abs=2e-3)
 
 
+def test_the_camera_stays_found_when_the_light_is_back(room_film):
+    """It is followed through frames with a tenth of the light, in which the map has its points anew."""
+    images, rng = room_film[0], np.random.default_rng(7)
+    dim = [np.clip(0.1 * image + 2.0 * rng.standard_normal(image.shape), 0, 255) for image in images[35:65]]
+    frames = follow(Slam(CAMERA), [*images[:35], *(image.astype(np.uint8) for image in dim), *images[65:80]])
+    assert statuses(frames[35:65]) == [TRACKED] * 30
+    assert any(frame.is_keyframe for frame in frames[35:65])
+    assert set(statuses(frames[66:])) == {TRACKED}
+
+
 @pytest.fixture(scope="module", params=[room, wall], ids=["room", "wall"])
 def small_map(request):
     """A frozen map made by moving a quarter of a metre, the film, and the last pose."""

@@ -81,6 +81,25 @@ class FewViews:
             left &= ~seen
 
 
+class ViewsOf:
+    """Points are looked for from the first of some keyframes that sees them; others as the map has it.
+
+    After a dark or blurred stretch, the map has its points as they were seen there.
+
+    Attributes
+    ----------
+    template_keyframe, template_pixels : (p,), (p, 2) of each point of the map.
+    """
+
+    def __init__(self, rigid_map: RigidMap, keyframes: Indices) -> None:
+        self.template_keyframe = rigid_map.template_keyframe.copy()
+        self.template_pixels = rigid_map.template_pixels.copy()
+        for number in keyframes[::-1].tolist():
+            keyframe = rigid_map.keyframes[number]
+            self.template_keyframe[keyframe.point_ids] = number
+            self.template_pixels[keyframe.point_ids] = keyframe.pixels
+
+
 Mask = NDArray[np.bool_]
 #: Points are looked for from a keyframe only if they are seen from there at about this angle and distance.
 MOST_VIEW_ANGLE_DEG = 35.0
@@ -304,23 +323,36 @@ class Tracker:
         """Where points are seen, at the instant of the frame's middle row, as far as the motion goes on."""
         return seen_at_middle_row(self._camera, pose, self._twist, self._map.positions[seen.ids], seen)
 
-    def find(self, image: Pyramid, guesses: Followed, pose: Array, levels: int) -> Followed:
-        """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose."""
+    def find(
+        self, image: Pyramid, guesses: Followed, pose: Array, levels: int, views: ViewsOf | None = None
+    ) -> Followed:
+        """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose (4, 4).
+
+        In a map that grows ``views`` may say which keyframes these are.
+        """
         if self._views is not None:
             self._views.choose(guesses.ids)
-        return self._look_for(image, guesses, pose, levels)
+        return self._look_for(image, guesses, pose, levels, views=views)
 
-    def _look_for(self, image: Pyramid, guesses: Followed, pose: Array, levels: int, reach: float = np.inf) -> Followed:
+    def _look_for(
+        self,
+        image: Pyramid,
+        guesses: Followed,
+        pose: Array,
+        levels: int,
+        reach: float = np.inf,
+        views: ViewsOf | None = None,
+    ) -> Followed:
         guesses = guesses[inside(guesses.pixels, shape_of(image), 0.0)]
         ids = guesses.ids
         if not len(ids):
             return guesses
-        of_views = self._map if self._views is None else self._views
-        views, pixels = of_views.template_keyframe[ids], of_views.template_pixels[ids]
-        keyframes = self._keyframe_poses(views)
-        outdated = self._templates.outdated(ids, views, pose, keyframes, self._map.positions, pixels)
-        for number in np.unique(views[outdated]).tolist():
-            rows = outdated & (views == number)
+        of_views = self._views or views or self._map
+        seen_from, pixels = of_views.template_keyframe[ids], of_views.template_pixels[ids]
+        keyframes = self._keyframe_poses(seen_from)
+        outdated = self._templates.outdated(ids, seen_from, pose, keyframes, self._map.positions, pixels)
+        for number in np.unique(seen_from[outdated]).tolist():
+            rows = outdated & (seen_from == number)
             self._templates.make(ids[rows], pixels[rows], self._pyramid_of(number))
         found, likeness = self._templates.align(ids, image, guesses.pixels, levels, reach)
         return Followed(ids, found)[likeness > LEAST_CORRELATION]
@@ -398,9 +430,15 @@ class Tracker:
         self._map.n_expected[wanted.ids[~self._among(found.ids)[wanted.ids]]] += 1
         return found[errors < SEARCH_RADIUS_PX]
 
-    def is_similar_view(self, ids: Indices, pose: Array) -> Mask:
-        """Whether points look from here about as from their keyframe."""
-        poses, rows = self._keyframe_poses(self._map.template_keyframe[ids])
+    def look_from(self, ids: Indices, views: ViewsOf) -> None:
+        """In a map that grows look for points from other keyframes from now on; of a complete map views are chosen."""
+        if self._views is None:
+            self._map.template_keyframe[ids] = views.template_keyframe[ids]
+            self._map.template_pixels[ids] = views.template_pixels[ids]
+
+    def is_similar_view(self, ids: Indices, pose: Array, views: ViewsOf | None = None) -> Mask:
+        """Whether points look from here about as from their keyframe, or from the one that ``views`` has."""
+        poses, rows = self._keyframe_poses((views or self._map).template_keyframe[ids])
         return similar_views(pose, poses, rows, self._map.positions[ids])
 
     def _chosen(self, ids: Indices, most: int) -> Indices:
