@@ -14,9 +14,9 @@ from morph_dslam.slam.result import SlamFrame, SlamStatus
 from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import FrameSource
 
-#: A pose that was not found when the frame came needs more points, and fewer that disagree: chance agreement of a few
-#: is likelier there, in the dark say, and no frame after it would tell.
-LATE_INLIERS, MOST_DISAGREEING = 2 * LEAST_INLIERS, 0.25
+#: A pose that was not found when the frame came needs more points: chance agreement of a few is likelier there, in the
+#: dark say, and no frame after it would tell.
+LATE_INLIERS = 2 * LEAST_INLIERS
 
 
 def find_rest(slam: Slam, frames: Sequence[SlamFrame], source: FrameSource) -> list[SlamFrame]:
@@ -40,14 +40,9 @@ def find_rest(slam: Slam, frames: Sequence[SlamFrame], source: FrameSource) -> l
         if image.index in missing:
             row = missing[image.index]
             found = finder.process_frame(image.image, image.index, image.timestamp, image.depth, image.right)
-            if found.pose is not None and _is_believed(found):
+            if found.pose is not None and found.n_points >= LATE_INLIERS:
                 times = {name: getattr(frames[row], name) for name in ("timings_ms", "total_ms", "waited_ms")}
                 records[row] = replace(found.record(is_final=False), status=SlamStatus.FOUND_LATER, **times)
         if image.index == last:
             break
     return records
-
-
-def _is_believed(frame: SlamFrame) -> bool:
-    """Whether many points agree on a frame's pose, and few do not."""
-    return frame.n_points >= LATE_INLIERS and frame.n_disagreeing <= MOST_DISAGREEING * frame.n_points
