@@ -13,7 +13,7 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam.cli.app import main
-from morph_dslam.errors import MapError, TrackingError
+from morph_dslam.errors import MapError, RegistrationError, TrackingError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.registration.registration import PosePrior
@@ -213,6 +213,20 @@ def test_a_tracker_knows_from_the_scene_what_an_object_looks_like_and_where_it_i
         assert result.estimate.state.parameters[0] == pytest.approx(truth["parameters"][frame.index, 0], abs=0.5e-3)
         assert np.linalg.norm(result.pose.translation - true_pose(truth, frame.index).translation) < MAP_ERROR
     assert len(scene.points) == n_points  # what can move was taken out of a copy
+
+
+@pytest.mark.parametrize("pose", ["map", "free"])
+def test_a_registration_in_a_map_is_refused_without_its_scene(recording, pose):
+    """The first frame that is tracked is not the one that it was made in; a picture of that one is enough."""
+    folder, _ = recording
+    model, camera = md.load_model(folder / "sheet.morph"), md.load_camera(folder / "sequence" / "camera.yaml")
+    registration = md.load_registration(folder / "registration.json", model)
+    with pytest.raises(RegistrationError, match=rf"made in a map.*load_scene.*of frame {registration.frame} as ref"):
+        md.Tracker(model, camera, registration, md.TrackerOptions(pose=pose))
+    (first,) = frames_of(folder, registration.frame, registration.frame)
+    tracker = md.Tracker(model, camera, registration, reference=first.image)
+    (second,) = frames_of(folder, registration.frame + 1, registration.frame + 1)
+    assert tracker.track(second).tracked
 
 
 def test_the_outline_counts_where_only_keyframes_show_what_the_object_looks_like(recording):

@@ -96,6 +96,7 @@ def test_the_camera_of_a_known_map_is_not_checked_and_one_that_is_elsewhere_is_t
     scene = track(room, poses)
     assert scene.camera_estimate() is None
     assert scene.summary()["flags"] == []
+    assert scene.summary()["scale"] == "the unit of the given map or poses"
     known = replace(scene, slam=None)
     known.map.camera_notes = ("of the map's recording",)
     assert map_scene(Film(room[1][:3]), CAMERA, known=known).summary()["flags"] == ["of the map's recording"]

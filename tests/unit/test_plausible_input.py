@@ -133,6 +133,10 @@ def test_a_map_made_with_another_lens_says_by_how_much(tmp_path):
         ([0.0, 0.1, 0.3, 0.2, 0.4], 0.0, ("the timestamps go back at frames 3",)),
         (np.arange(9) * 33_333_333.0, 0.02, ("3.33e+07 s apart", "nanoseconds")),
         (np.arange(9) / 30.0, 0.33, ("readout_s", "0.33 s", "0.0333 s")),
+        # A tenth above the time between frames is the error of an estimate.
+        (np.arange(9) / 30.0, 0.0337, ()),
+        (np.arange(9) / 30.0, 0.0366, ()),
+        (np.arange(9) / 30.0, -0.0368, ("readout_s", "0.0368 s", "0.0333 s")),
         ([5.0], 0.02, ()),
     ],
 )
@@ -187,7 +191,11 @@ def test_a_path_without_scale_has_no_error_without_alignment_of_scale(tmp_path, 
     left = 500.0 * np.sqrt(np.mean(np.sum(centred**2, axis=1)))
     for given, without_scale in ((run, is_metric), (run / "trajectory.txt", is_metric), (tmp_path / "alone.txt", True)):
         assert cli.main(["evaluate", str(given), "--trajectory", str(tmp_path / "truth.txt")]) == 0
-        *notes, line = capsys.readouterr().out.splitlines()
+        wrote, *notes, line = capsys.readouterr().out.splitlines()
+        beside = tmp_path / "alone_evaluation" if given.stem == "alone" else run / "trajectory_evaluation"
+        assert wrote == f"wrote {beside}.json and {beside.name}.png"
+        assert beside.with_suffix(".json").is_file()
+        assert beside.with_suffix(".png").is_file()
         figures = dict(part.split("=") for part in line.split())
         assert float(figures["ate_se3_mm"]) == pytest.approx(left if without_scale else np.nan, abs=0.01, nan_ok=True)
         assert (float(figures["ate_sim3_mm"]), float(figures["scale"])) == pytest.approx((0.0, 2.0), abs=1e-3)

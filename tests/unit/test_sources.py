@@ -200,6 +200,46 @@ def test_names_that_give_no_order(tmp_path):
         open_source(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        # By text, or by their last digits, these would be in another order.
+        (("999.9.png", "1000.05.png", "1000.5.png"), (999.9, 1000.05, 1000.5)),
+        (("1305031100.500000.png", "1305031101.033333.png", "1305031101.500000.jpg"), None),
+        (("1305031100.5", "1305031101.25"), (1305031100.5, 1305031101.25)),
+        (("1403636579763555584.png", "1403636579813555456.png"), (1403636579.763555584, 1403636579.813555456)),
+        (("9999999999999999.png", "10000000000000000.png"), (9999999.999999999, 10000000.0)),
+    ],
+)
+def test_names_that_are_times_give_order_and_timestamps(tmp_path, names, times):
+    for number, name in enumerate(names):
+        picture = cv2.imencode(".png", grey(10 * number))[1].tobytes()
+        (tmp_path / name).write_bytes(picture)
+    source = open_source(tmp_path)
+    frames = list(source)
+    assert [frame.index for frame in frames] == list(range(len(names)))
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [10 * number for number in range(len(names))]
+    times = times or (1305031100.5, 1305031101.033333, 1305031101.5)
+    np.testing.assert_allclose([frame.timestamp for frame in frames], times, rtol=0, atol=3e-7)
+    assert [frame.index for frame in open_source(tmp_path, 1, 1)] == [1]
+
+
+def test_the_rate_of_images_named_by_times_is_theirs(tmp_path):
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{1000.0 + 0.05 * number:.6f}.png"), grey(number))
+    assert open_source(tmp_path).fps == pytest.approx(20.0)
+
+
+def test_names_of_which_not_all_are_times_are_numbers(tmp_path):
+    """And two images of one time are refused."""
+    for name in ("1.5.png", "shot-2.png"):
+        cv2.imwrite(str(tmp_path / name), grey(1))
+    assert [frame.index for frame in open_source(tmp_path)] == [2, 5]
+    (tmp_path / "shot-2.png").rename(tmp_path / "1.50.png")
+    with pytest.raises(SourceError, match=r"two images of the same time, 1\.5\.png and 1\.50\.png: keep one"):
+        open_source(tmp_path)
+
+
 def save_image(path, value, size=(12, 16)):
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), np.full((*size, 3), value, dtype=np.uint8))

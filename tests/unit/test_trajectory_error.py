@@ -110,7 +110,8 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, capsys):
     save_trajectory(tmp_path / "truth.txt", helix())
     command = ["evaluate", str(run), "--trajectory", str(tmp_path / "truth.txt")]
     assert cli.main(command) == 0
-    note, line = capsys.readouterr().out.splitlines()
+    wrote, note, line = capsys.readouterr().out.splitlines()
+    assert wrote == f"wrote {run / 'trajectory_evaluation.json'} and trajectory_evaluation.png"
     assert "2 times as large as the estimated one" in note
     assert line.startswith("pairs=61/61 ate_se3_mm=")
     assert "ate_sim3_mm=0.00 scale=2.0000 rpe_mm=0.00 rpe_deg=0.000" in line

@@ -10,7 +10,8 @@ KEPT = "the run is unchanged"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    add_file(command, "run_folder", "run folder, or a trajectory file", "RUN")
+    written = "the figures are written into it, those of FILE.txt beside it as FILE_evaluation.json and .png"
+    add_file(command, "run_folder", f"run folder, or a trajectory file; {written}", "RUN")
     truth = command.add_mutually_exclusive_group(required=True)
     add_file(truth, "--points", "truth file, .npz (docs/run-folder.md)", "TRUTH")
     add_file(truth, "--pixels", "points followed in the images, CSV with frame,id,u,v", "TRACKS")
@@ -62,7 +63,10 @@ def run(arguments: argparse.Namespace) -> None:
     _check(arguments)
     folder = arguments.run_folder
     if arguments.trajectory is not None:
-        print(trajectory_line(evaluate_trajectory(folder, arguments.trajectory)))
+        figures = evaluate_trajectory(folder, arguments.trajectory)
+        path = folder / "trajectory.txt" if folder.is_dir() else folder
+        print(f"wrote {path.with_name(f'{path.stem}_evaluation.json')} and {path.stem}_evaluation.png")
+        print(trajectory_line(figures))
     elif arguments.depth is not None:
         found = evaluate_depth(folder, arguments.depth, arguments.base_frame, arguments.depth_per_metre)
         print(f"wrote {folder / 'depth_evaluation.json'} and depth_evaluation.png")

@@ -28,7 +28,7 @@ from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, find_pose, inside, project, refine_pose
 from morph_dslam.slam.result import NoPose, SlamReason
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
-from morph_dslam.slam.tracking import Tracker, ViewsOf
+from morph_dslam.slam.tracking import Tracker
 from morph_dslam.tracking.patches import spread_corners
 
 Array = NDArray[np.float64]
@@ -217,7 +217,7 @@ class Relocalizer:
         """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
         ids = np.unique(np.concatenate([self._map.good_in(k) for k in group]))
         guesses, _ = project(pose, self._map.positions[ids], self._intrinsics)
-        views = ViewsOf(self._map, group)
+        views = tracker.views_of(group)
         seen = inside(guesses, view.normalized.shape, PATCH_HALF + 2) & tracker.is_similar_view(ids, pose, views)
         found = tracker.find(view.pyramid, Followed(ids[seen], guesses[seen]), pose, 2, views)
         refined = refine_pose(pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=INLIER_PX)
@@ -226,5 +226,6 @@ class Relocalizer:
         if refined.inliers.sum() < enough or refined.rms_px > most:
             return None
         found = found[refined.inliers]
-        tracker.look_from(found.ids, views)
+        if views is not None:
+            tracker.look_from(found.ids, views)
         return refined, found

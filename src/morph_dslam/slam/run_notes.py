@@ -15,6 +15,9 @@ from morph_dslam.slam.slam import Slam
 MOST_NAMED = 5
 #: No camera waits so long between frames, seconds: the times are in another unit.
 LONGEST_INTERVAL_S = 1e5
+#: An estimated readout time may exceed the time between frames by this share: a sensor may read without a pause, and
+#: the estimate has an error.
+READOUT_ABOVE_INTERVAL = 0.1
 
 
 def run_notes(slam: Slam, frames: Sequence[SlamFrame], after: Sequence[SlamFrame]) -> Iterator[str]:
@@ -69,7 +72,7 @@ def time_notes(frames: Sequence[SlamFrame], readout_s: float = 0.0) -> Iterator[
         )
     if back.any():
         yield f"the timestamps go back at frames {_named(numbers[back])}: the order of the frames is kept"
-    if abs(readout_s) > interval > LEAST_GAP_S:
+    if abs(readout_s) > (1.0 + READOUT_ABOVE_INTERVAL) * interval and interval > LEAST_GAP_S:
         yield (
             f"readout_s of the camera file, {abs(readout_s):g} s, is longer than the time between frames, "
             f"{interval:.3g} s, which no camera does: correct one of them"

@@ -88,7 +88,7 @@ class Scene:
 
     @property
     def points(self) -> Array:
-        """Map points (n, 3), metres, or in units of the first view's median depth."""
+        """Map points (n, 3), metres, or in units of the first view's median depth or of the given poses."""
         return self.map.positions[self.map.good]
 
     @property
@@ -136,6 +136,12 @@ class Scene:
         together = np.concatenate(depths) if depths else np.empty(0)
         return float(np.median(together)) if len(together) else None
 
+    def _unit(self) -> str:
+        """What one unit of a map is that is not metric."""
+        if self.slam is not None and self.slam.knows_map:
+            return "the unit of the given map or poses"
+        return "the median depth of the map's first view is 1"
+
     def save(self, path: str | Path) -> None:
         """Write map and path into one file, which `load_scene` and the commands read."""
         try:
@@ -149,7 +155,7 @@ class Scene:
             "n_tracked": len(self.trajectory),
             "n_keyframes": len(self.keyframes),
             "n_map_points": len(self.map.good),
-            "scale": "metres" if self.is_metric else "the median depth of the map's first view is 1",
+            "scale": "metres" if self.is_metric else self._unit(),
             "median_depth_m": self._median_depth() if self.is_metric else None,
         }
         return content | (_summary_of_run(self, self.slam) if self.slam is not None else {})

@@ -328,7 +328,7 @@ class Tracker:
     ) -> Followed:
         """Points found near their guessed pixels, by the patches of their keyframes as seen from a pose (4, 4).
 
-        In a map that grows ``views`` may say which keyframes these are.
+        In a map that grows ``views`` may say which keyframes these are (`views_of`).
         """
         if self._views is not None:
             self._views.choose(guesses.ids)
@@ -430,11 +430,14 @@ class Tracker:
         self._map.n_expected[wanted.ids[~self._among(found.ids)[wanted.ids]]] += 1
         return found[errors < SEARCH_RADIUS_PX]
 
+    def views_of(self, keyframes: Indices) -> ViewsOf | None:
+        """Some keyframes to look for points from; None in a complete map, of which views are chosen anyway."""
+        return None if self._views is not None else ViewsOf(self._map, keyframes)
+
     def look_from(self, ids: Indices, views: ViewsOf) -> None:
-        """In a map that grows look for points from other keyframes from now on; of a complete map views are chosen."""
-        if self._views is None:
-            self._map.template_keyframe[ids] = views.template_keyframe[ids]
-            self._map.template_pixels[ids] = views.template_pixels[ids]
+        """Look for points from other keyframes from now on."""
+        self._map.template_keyframe[ids] = views.template_keyframe[ids]
+        self._map.template_pixels[ids] = views.template_pixels[ids]
 
     def is_similar_view(self, ids: Indices, pose: Array, views: ViewsOf | None = None) -> Mask:
         """Whether points look from here about as from their keyframe, or from the one that ``views`` has."""

@@ -80,7 +80,8 @@ def open_source(path: str | Path, first: int | None = None, last: int | None = N
     Parameters
     ----------
     path : a folder of images, whose frames are numbered by the last number in each file name (`001.jpg` is
-        frame 1); a folder in the layout of TUM RGB-D, EuRoC or 7-Scenes; a video file, or a ROS 1 or ROS 2
+        frame 1), or from 0 if all names are times (`1305031100.5.png`, in seconds, or 16 digits or more, in
+        nanoseconds); a folder in the layout of TUM RGB-D, EuRoC or 7-Scenes; a video file, or a ROS 1 or ROS 2
         bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
     first, last : range of frame numbers, both included; open ends by default
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,9 @@ MOST_TIME_DIFFERENCE = 0.02
 SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
 #: 7-Scenes carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
+#: Names of images that are times: seconds with a fraction as of TUM RGB-D, or nanoseconds as of EuRoC. Numbers of
+#: frames have fewer digits.
+_SECONDS, _NANOSECONDS = re.compile(r"\d+\.\d+", re.ASCII), re.compile(r"\d{16,}", re.ASCII)
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")
 
 
@@ -164,9 +168,36 @@ def _hint(folder: Path) -> str:
 
 
 def image_folder(folder: Path, first: int | None = None, last: int | None = None) -> RecordedFrames:
-    """A folder of numbered images; gaps in the numbering are kept as they are."""
+    """A folder of images whose names are times, numbered from 0; or of numbered ones, whose gaps are kept."""
+    if timed := _timed_images(folder):
+        in_turn = [_ImageRecord(index, timestamp, path) for index, (timestamp, path) in enumerate(timed)]
+        return RecordedFrames(folder, in_turn, first, last)
     records = [_ImageRecord(number, number / ASSUMED_FPS, path) for number, path in numbered_images(folder).items()]
     return RecordedFrames(folder, records, first, last, fps=ASSUMED_FPS)
+
+
+def _timed_images(folder: Path) -> list[tuple[float, Path]]:
+    """The images of a folder with their times in seconds, in this order; empty if not all names are times.
+
+    Raises SourceError if two have the same time.
+    """
+    # What is no ending of images is a part of the name.
+    names = {path: path.stem if named_kind(path) in IMAGES else path.name for path in image_files(folder)}
+    kind = next((kind for kind in (_SECONDS, _NANOSECONDS) if all(map(kind.fullmatch, names.values()))), None)
+    if kind is None:
+        return []
+    # Decimals are exact; float64 would round nanoseconds.
+    images: dict[Decimal, Path] = {}
+    for path, name in names.items():
+        time = Decimal(name)
+        if time in images:
+            raise SourceError(
+                f"{folder} has two images of the same time, {images[time].name} and {path.name}: keep one of them, or, "
+                "if their names are no times, number the images without a point"
+            )
+        images[time] = path
+    unit = 1 if kind is _SECONDS else 10**9
+    return [(float(time / unit), images[time]) for time in sorted(images)]
 
 
 def is_tum(folder: Path) -> bool:

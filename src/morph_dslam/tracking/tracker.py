@@ -53,7 +53,7 @@ from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import error_factors_of
-from morph_dslam.tracking.tracker_inputs import Picture, check_camera, check_pose, check_tracker
+from morph_dslam.tracking.tracker_inputs import Picture, check_camera, check_look, check_pose, check_tracker
 from morph_dslam.tracking.views import (
     ActiveView,
     Change,
@@ -118,7 +118,8 @@ class Tracker:
     Raises
     ------
     RegistrationError
-        If a free object shows too few corners in the reference frame, or its place in the scene has no covariance.
+        If a free object shows too few corners in the reference frame, its place in the scene has no covariance, or it
+        was registered in a map and neither its scene nor ``reference``, ``keyframes`` or ``anchor`` is given.
     TrackingError
         If a per-sequence parameter, or one that walks, is not in the model, or the pose is to be fixed without a map.
     ArgumentError
@@ -141,10 +142,12 @@ class Tracker:
     ) -> None:
         check_tracker(model, registration, options)
         check_camera(camera)
+        in_map = anchor is not None or keyframes is not None
+        check_look(registration, is_given=in_map or reference is not None)
         announce_compilation()
         self.model = registration.model if registration.per_sequence else model
         self.camera, self.options, self.anchor = camera, options or TrackerOptions(), anchor
-        check_pose(self.options, registration, in_map=anchor is not None or keyframes is not None)
+        check_pose(self.options, registration, in_map)
         self.estimator = Estimator(self.model, camera, self.options.estimation)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._undistortion = camera.undistortion_maps()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import ArgumentError, SourceError, TrackingError, check_kind
+from morph_dslam.errors import ArgumentError, RegistrationError, SourceError, TrackingError, check_kind
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
@@ -75,6 +75,26 @@ def check_pose(options: TrackerOptions, registration: Registration, in_map: bool
         )
     if options.pose == "fixed" and registration.map_registration is None and not in_map:
         raise TrackingError(f"pose='fixed': {NO_MAP}")
+
+
+def check_look(registration: Registration, is_given: bool) -> None:
+    """Raise RegistrationError if an object was registered in a map, and nothing tells what it looks like there.
+
+    The first frame that is tracked would be taken for the one of the registration, which is a keyframe of the map, and
+    every result would be off by what the camera moved between the two.
+
+    Parameters
+    ----------
+    registration : of the object.
+    is_given : whether the tracker is given a picture, keyframes or a map beside the registration.
+    """
+    if registration.map_registration is not None and registration.scene is None and not is_given:
+        of_frame = "" if registration.frame is None else f" of frame {registration.frame}"
+        raise RegistrationError(
+            "the registration was made in a map, and without its scene a tracker does not know what the object looks "
+            "like: read it as load_registration(path, model, scene) with scene = md.load_scene('map.h5', camera), or "
+            f"give the picture{of_frame} as reference="
+        )
 
 
 @dataclass(frozen=True)
