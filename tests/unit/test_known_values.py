@@ -52,6 +52,8 @@ def test_a_table_has_values_and_deviations_by_frame(tmp_path):
         (["frame,arch_mm", "3,90"], "arch is 90 mm, outside of the model's range from -60 to 60 mm"),
         (["frame,arch_mm,arch_std_mm", "3,9,0"], "the deviation of arch is not above zero"),
         (["frame,arch_mm", "3,"], "has no value of a parameter"),
+        (["frame,arch_mm", "3,1,5"], "line 2: 3 cells under 2 titles"),
+        (["frame,arch_mm", "3"], "line 2: 1 cells under 2 titles"),
         ([], "needs the columns frame"),
     ],
 )

@@ -57,6 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
         pixel_remarks,
         remarks,
         result_line,
+        trajectory_evaluation_files,
         trajectory_line,
     )
 
@@ -64,8 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     folder = arguments.run_folder
     if arguments.trajectory is not None:
         figures = evaluate_trajectory(folder, arguments.trajectory)
-        path = folder / "trajectory.txt" if folder.is_dir() else folder
-        print(f"wrote {path.with_name(f'{path.stem}_evaluation.json')} and {path.stem}_evaluation.png")
+        content, picture = trajectory_evaluation_files(folder)
+        print(f"wrote {content} and {picture.name}")
         print(trajectory_line(figures))
     elif arguments.depth is not None:
         found = evaluate_depth(folder, arguments.depth, arguments.base_frame, arguments.depth_per_metre)

@@ -243,9 +243,16 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     figures["notes"] = [*mistakes, *_scale_notes(figures, bool(mistakes))]
     if path is not None:
         with writing(EvaluationError, path.parent):
-            path.with_name(f"{path.stem}_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
-            plot_trajectory(path.with_name(f"{path.stem}_evaluation.png"), estimate, expected, *errors["sim3"])
+            content, picture = trajectory_evaluation_files(path)
+            content.write_text(json.dumps(figures, indent=2) + "\n")
+            plot_trajectory(picture, estimate, expected, *errors["sim3"])
     return figures
+
+
+def trajectory_evaluation_files(run: Path) -> tuple[Path, Path]:
+    """Figures and picture that `evaluate_trajectory` writes for a run folder or a trajectory file."""
+    path = _trajectory_file(run)
+    return path.with_name(f"{path.stem}_evaluation.json"), path.with_name(f"{path.stem}_evaluation.png")
 
 
 def _trajectory_file(path: Path) -> Path:

@@ -37,6 +37,9 @@ from morph_dslam.evaluation.run_folder import (
     remarks as remarks,
     result_line as result_line,
 )
-from morph_dslam.evaluation.trajectory import trajectory_line as trajectory_line
+from morph_dslam.evaluation.trajectory import (
+    trajectory_evaluation_files as trajectory_evaluation_files,
+    trajectory_line as trajectory_line,
+)
 from morph_dslam.surface_distances import distances_to_surface as distances_to_surface
 from morph_dslam.tracking.observability import value_line as value_line

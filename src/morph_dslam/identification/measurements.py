@@ -19,7 +19,7 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import ReactionInDirection
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.io.text import name_and_unit, read_csv
+from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.model.reduced_model import FORCE, REACTION
@@ -232,7 +232,7 @@ class _PointTable:
         if not rows:
             raise IdentificationError(f"{path} has no points below its titles")
         for line, cells in rows:
-            if len(cells) < len(titles) or any(cells[len(titles) :]):
+            if not has_a_cell_for_each(titles, cells):
                 raise IdentificationError(
                     f"{path}, line {line}: {len(cells)} cells under {len(titles)} titles; keep the commas of empty "
                     "cells, and write decimals with points"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,14 @@ def read_csv(path: Path, what: str, error_class: type[MorphError]) -> list[tuple
         if rows and separator in rows[0][1][0]:
             raise error_class(f"{path} is separated by {name}: write commas between cells, and decimals with points")
     return rows
+
+
+def has_a_cell_for_each(titles: Sequence[str], cells: Sequence[str]) -> bool:
+    """Whether a line of a table has a cell, perhaps an empty one, for each title, and none beside them.
+
+    Decimals with commas make more.
+    """
+    return len(cells) >= len(titles) and not any(cells[len(titles) :])
 
 
 def name_and_unit(header: str) -> tuple[str, str]:

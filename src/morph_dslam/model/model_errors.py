@@ -63,8 +63,8 @@ class ModelErrors:
         """In the state ``mu`` (d,), SI."""
         covariance, squared = np.zeros((len(mu), len(mu))), 0.0
         if self.mesh is not None:
-            covariance += self.mesh.covariance(mu)
-            squared += self.mesh.left(mu) ** 2
+            of_parameters, left = self.mesh.at(mu)
+            covariance, squared = covariance + of_parameters, left**2
         if self.reduction is not None:
             own = len(mu) - self.n_loads
             covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own])

@@ -97,6 +97,12 @@ def _entry(model: ReducedModel, states: Sequence[tuple[Array, Array, Array]]) ->
     }
 
 
+def surface_modes(model: ReducedModel) -> Array:
+    """The displacement's modes (m, 3 s) at the surface's nodes (s,)."""
+    nodes, field = np.unique(model.triangles), model.displacement
+    return field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
+
+
 def _rms(displacement: Array) -> float:
     """Root mean square length of vectors (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(displacement**2, axis=1))))
@@ -134,27 +140,28 @@ class ParameterErrors:
         moved = sizes > 0.0
         if not moved.any():
             return None
-        nodes, field = np.unique(model.triangles), model.fields["displacement"]
-        modes = field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
-        share = float(np.sqrt(np.mean((left[moved] / sizes[moved]) ** 2)))
-        products = modes @ modes.T / len(nodes)
-        return cls(errors[moved] / sizes[moved, None], share, field.functions, products, model.n_loads)
+        modes, share = surface_modes(model), float(np.sqrt(np.mean((left[moved] / sizes[moved]) ** 2)))
+        products, functions = modes @ modes.T / (modes.shape[1] // 3), model.displacement.functions
+        return cls(errors[moved] / sizes[moved, None], share, functions, products, model.n_loads)
 
-    def covariance(self, mu: Array) -> Array:
-        """Covariance (d, d) of the parameters at a state ``mu`` (d,), SI."""
-        return np.asarray(self._squared(mu) * self.per_metre.T @ self.per_metre / len(self.per_metre))
-
-    def left(self, mu: Array) -> float:
-        """Error of the displacement at a state ``mu`` (d,), SI, that parameters cannot make good, metres."""
-        return self.left_share * float(np.sqrt(self._squared(mu)))
+    def at(self, mu: Array) -> tuple[Array, float]:
+        """Covariance (d, d) of the parameters at a state ``mu`` (d,), SI, and the error of the displacement left, m."""
+        squared = self._squared(mu)
+        covariance = squared * self.per_metre.T @ self.per_metre / len(self.per_metre)
+        return covariance, self.left_share * float(np.sqrt(squared))
 
     def _squared(self, mu: Array) -> float:
         """Mean square displacement of the surface, squared metres.
 
         Where unknown loads push back what the study's own have moved, the body is strained by both.
         """
-        by_study = mu.copy()
-        by_study[len(mu) - self.n_loads :] = 0.0
-        rows = [self.functions.rows(self.functions.nearest_inside(state))[0].copy() for state in (by_study, mu)]
-        parts = (rows[0], rows[1] - rows[0])
+        row = self._row(mu)
+        parts = [row]
+        if self.n_loads:
+            by_study = self._row(np.append(mu[: -self.n_loads], np.zeros(self.n_loads)))
+            parts = [by_study, row - by_study]
         return max(float(sum(row @ self.products @ row for row in parts)), 0.0)
+
+    def _row(self, mu: Array) -> Array:
+        """Values (m,) of the displacement's functions."""
+        return self.functions.rows(self.functions.nearest_inside(mu))[0]

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.functions import Functions
+from morph_dslam.model.parameter_errors import surface_modes
 from morph_dslam.model.reduced_model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -25,14 +26,13 @@ HELD_OUT, ON_MODES = "held_out", "error_on_modes_m2"
 
 def errors_on_modes(model: ReducedModel, errors: Iterable[Array]) -> list[list[float]]:
     """Mean products (k, m), m2, of displacement errors (n, 3) at the nodes, metres, with the modes on the surface."""
-    modes, nodes = _surface_modes(model), np.unique(model.triangles)
+    modes, nodes = _deforming_modes(model), np.unique(model.triangles)
     return [(modes @ error[nodes].astype(np.float64).ravel() / len(nodes)).tolist() for error in errors]
 
 
-def _surface_modes(model: ReducedModel) -> Array:
-    """The displacement's modes (m, 3 s) at the surface's nodes, without rigid motions."""
-    nodes, field = np.unique(model.triangles), model.displacement
-    modes = field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
+def _deforming_modes(model: ReducedModel) -> Array:
+    """The displacement's modes (m, 3 s) at the surface's nodes (s,), without rigid motions."""
+    nodes, modes = np.unique(model.triangles), surface_modes(model)
     arms = model.nodes[nodes] - model.nodes[nodes].mean(axis=0)
     rigid = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(nodes), 1)), np.cross(axis, arms))]
     motions, _ = np.linalg.qr(np.reshape(rigid, (6, -1)).T)
@@ -69,9 +69,9 @@ class ReductionErrors:
         wanted = (len(states), model.displacement.n_modes), (len(on_modes), len(model.parameters))
         if not len(states) or not len(model.parameters) or (on_modes.shape, states.shape) != wanted:
             return None
-        modes = _surface_modes(model)
+        modes = _deforming_modes(model)
         size = 1e-3 * float(np.sqrt(np.mean(np.square(stated["mean_mm"]))))
-        products = modes @ modes.T / len(np.unique(model.triangles))
+        products = modes @ modes.T / (modes.shape[1] // 3)
         return cls(states, on_modes, size, model.upper - model.lower, model.displacement.functions, products)
 
     def covariance(self, mu: Array, constant: NDArray[np.bool_]) -> Array:

@@ -23,7 +23,7 @@ TIMES, SHARE = 20.0, 0.05
 #: Beyond the others a smooth field may rise steeply. There only a value so many times theirs is far off, and one that
 #: is zero where they make expect this share of their largest.
 TIMES_BEYOND, SHARE_ZERO = 100.0, 0.4
-#: Least error that is told from rounding, over the largest value.
+#: Least error that can be distinguished from rounding, over the largest value.
 ROUNDING = 1e-8
 #: Part and number of the states that may be wrong at most for the others to tell.
 WRONG, MOST_WRONG = 0.1, 10

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.text import name_and_unit, read_csv
+from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import Parameter
 from morph_dslam.units import FACTORS, quantity_of, read_quantity, to_si
 
@@ -45,7 +45,7 @@ class SolutionTable:
         if "file" not in header or not content:
             raise StudyError(f"{path} needs a column 'file' and a row for each solution")
         for line, cells in content:
-            if len(cells) < len(header) or any(cells[len(header) :]):
+            if not has_a_cell_for_each(header, cells):
                 raise StudyError(
                     f"{path}, line {line}: {len(cells)} cells under {len(header)} headers; write decimals with points, "
                     "and a cell for each header"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
-from morph_dslam.io.text import read_csv
+from morph_dslam.io.text import has_a_cell_for_each, read_csv
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.tracking.levenberg_marquardt import Box
@@ -55,6 +55,11 @@ class KnownValues:
         columns = _Columns.of(path, header, model)
         by_frame: dict[int, Array] = {}
         for line, cells in lines:
+            if not has_a_cell_for_each(header, cells):
+                raise TrackingError(
+                    f"{path}, line {line}: {len(cells)} cells under {len(header)} titles; keep the commas of empty "
+                    "cells, and write decimals with points"
+                )
             frame, values = columns.row(f"{path}, line {line}", cells)
             if frame in by_frame:
                 raise TrackingError(f"{path}, line {line}: frame {frame} is there already; give each frame once")
@@ -123,11 +128,10 @@ class _Columns:
 
 def _number(where: str, cells: Sequence[str], column: int) -> float:
     """A cell's number; NaN where it is empty, but for the frame's."""
-    text = cells[column] if column < len(cells) else ""
     try:
-        return float(text or "nan")
+        return float(cells[column] or "nan")
     except ValueError:
-        raise TrackingError(f"{where}: '{text}' is no number") from None
+        raise TrackingError(f"{where}: '{cells[column]}' is no number") from None
 
 
 def check_known(where: str, model: ReducedModel, index: int, value: float, deviation: float) -> None:
@@ -158,13 +162,14 @@ class KnownParameters:
     Attributes
     ----------
     values : of a recording; None where there are none.
+    indices : of the parameters (k,) that are known in the present frame.
     squared_px : variance of an image coordinate, which turns likelihoods into costs in squared pixels.
     """
 
     def __init__(self, model: ReducedModel) -> None:
         self._model, self.squared_px = model, 0.25
         self.values: KnownValues | None = None
-        self._indices, self._now = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.indices, self._now = np.empty(0, dtype=np.int64), np.empty((0, 2))
 
     def begin(self, frame: int | None) -> None:
         """A frame of this number begins: its values of the recording's table count, if there is one."""
@@ -193,19 +198,14 @@ class KnownParameters:
 
     def _set(self, indices: NDArray[np.int64], values: Array) -> None:
         there = np.isfinite(values[:, 0])
-        self._indices, self._now = indices[: len(values)][there], values[there]
-
-    @property
-    def indices(self) -> NDArray[np.int64]:
-        """Of the parameters (k,) that are known in the present frame."""
-        return self._indices
+        self.indices, self._now = indices[: len(values)][there], values[there]
 
     def bounded(self, box: Box) -> Box:
         """The box with known parameters near their values: what a model cannot explain does not outweigh a sensor."""
-        if not len(self._indices):
+        if not len(self.indices):
             return box
         lower, upper, (value, deviation) = box.lower.copy(), box.upper.copy(), self._now.T
-        rows, most = self._indices, FARTHEST * deviation
+        rows, most = self.indices, FARTHEST * deviation
         lower[rows] = np.clip(value - most, box.lower[rows], box.upper[rows])
         upper[rows] = np.clip(value + most, box.lower[rows], box.upper[rows])
         return replace(box, lower=lower, upper=upper)
@@ -213,5 +213,5 @@ class KnownParameters:
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, and its Hessian's diagonal (k,) and gradient (k,) at parameters (n,); in squared pixels."""
         information = self.squared_px / self._now[:, 1] ** 2
-        away = parameters[self._indices] - self._now[:, 0]
+        away = parameters[self.indices] - self._now[:, 0]
         return 0.5 * float(information @ away**2), information, information * away

@@ -136,10 +136,8 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     inner = tuple(load_inner_structure(path) for path in part.inner)
     for structure in inner:
         structure.carried_by(model)  # raises before the tracking if it is not for this model
-    points, known = (
-        NamedPoints.of(model, part.points),
-        None if part.known is None else KnownValues.read(part.known, model),
-    )
+    points = NamedPoints.of(model, part.points)
+    known = None if part.known is None else KnownValues.read(part.known, model)
     again = {n: None if path is None else load_landmarks(path) for n, path in part.reregister_at}
     options = part.tracker
     if part.registration is None:

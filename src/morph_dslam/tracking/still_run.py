@@ -106,14 +106,14 @@ def _covariance_of(part: PlacedObject) -> Array:
 
 def _covariance_of_first_frame(part: PlacedObject) -> Array:
     """The same with what the model's own errors do to one frame; nothing at rest shows a per-sequence parameter."""
-    parameters, covariance = part.registration.state.parameters, _covariance_of(part).copy()
-    d, errors = len(parameters), ModelErrors.of(part.model)
+    covariance = _covariance_of(part).copy()
     if part.object.at_rest:
         unknown = [k for k, p in enumerate(part.model.parameters) if p.name in part.options.per_sequence]
         covariance[unknown], covariance[:, unknown] = 0.0, 0.0
         covariance[unknown, unknown] = Box.of(part.model).scale[unknown] ** 2
-    elif errors is not None:
-        covariance[:d, :d] += errors.at(parameters).parameters
+    elif (errors := ModelErrors.of(part.model)) is not None:
+        parameters = part.registration.state.parameters
+        covariance[: len(parameters), : len(parameters)] += errors.at(parameters).parameters
     return covariance
 
 
