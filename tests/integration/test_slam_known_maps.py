@@ -5,14 +5,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.cli.app import main
 from morph_dslam.errors import MapError
+from morph_dslam.evaluation.trajectory import evaluate_trajectory
 from morph_dslam.io.colmap import ColmapImage, read_colmap_model, write_colmap_model
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.slam.result import SlamStatus
-from morph_dslam.slam.scene import map_scene
-from tests.support.rendered_room import CAMERA, Film, RoomFilm, hand_held, pose
+from morph_dslam.slam.scene import load_scene, map_scene
+from tests.support.rendered_room import CAMERA, Film, RoomFilm, hand_held, pose, write_film
 
 #: Another program's world and unit.
 WORLD, UNIT = pose((3.0, -1.0, 2.0), (0.4, -0.2, 0.9)), 2.5
@@ -110,10 +112,9 @@ def test_what_does_not_fit_is_refused(room, poses, colmap):
     late = Trajectory(poses.timestamps + 100.0, poses.world_from_camera)
     with pytest.raises(MapError, match=r"only 0 of 40 frames of film .* 0\.000 to 1\.300 s.* 100\.000 to 101\.300"):
         track(room, late)
-    # Poses the wrong way round; or three frames late: points are somewhere, but not where the next frames have them.
-    for wrong in (poses.camera_from_world, np.roll(poses.world_from_camera, 3, axis=0)):
-        with pytest.raises(MapError, match="do not fit the images"):
-            track(room, Trajectory(poses.timestamps, wrong))
+    # Three frames late: points are somewhere, but not where the next frames have them.
+    with pytest.raises(MapError, match="do not fit the images"):
+        track(room, Trajectory(poses.timestamps, np.roll(poses.world_from_camera, 3, axis=0)))
     model = read_colmap_model(colmap)
     with pytest.raises(MapError, match=r"miss their pixels by \d+"):
         track(room, model, replace(CAMERA, fx=800.0, fy=800.0, cx=250.0, cy=200.0))
@@ -121,9 +122,54 @@ def test_what_does_not_fit_is_refused(room, poses, colmap):
         track(room, replace(model, images=[replace(i, name=f"shot_{9000 + i.number}.jpg") for i in model.images]))
 
 
-def test_the_command_takes_known_maps(tmp_path, room_folder, colmap, refused):
+def test_poses_of_another_convention_or_body_are_named(room, poses):
+    marker = pose((0.05, -0.03, 0.08), (0.2, 1.5, -0.4))
+    w_first = poses.world_from_camera.copy()
+    quaternions = Rotation.from_matrix(w_first[:, :3, :3]).as_quat(scalar_first=True)
+    w_first[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    for wrong, words in (
+        (poses.camera_from_world, "inverted"),
+        (poses.world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0]), "OpenGL"),
+        (w_first, "begin with qw"),
+        (poses.world_from_camera @ marker, "another body"),
+    ):
+        with pytest.raises(MapError, match=f"do not fit the images of film: they .*{words}"):
+            track(room, Trajectory(poses.timestamps, wrong))
+
+
+def test_poses_that_are_a_little_off_are_used(room, poses):
+    """Half a millimetre and a thirtieth of a degree, as of motion capture, at random."""
+    rng, noisy = np.random.default_rng(0), poses.world_from_camera.copy()
+    noisy[:, :3, 3] += UNIT * 0.0005 * rng.standard_normal((40, 3))
+    noisy[:, :3, :3] @= Rotation.from_rotvec(np.radians(0.03) * rng.standard_normal((40, 3))).as_matrix()
+    assert largest_error(room, track(room, Trajectory(poses.timestamps, noisy))) < 0.05
+
+
+def test_pictures_of_another_recording_are_not_those_of_a_model(room, colmap):
+    other = RoomFilm(seed=8)
+    film = Film([other.frame(place) for place in hand_held(40, seed=8)])
+    with pytest.raises(MapError, match=r"are not those of film.*--images"):
+        map_scene(Film(room[1][:3]), CAMERA, known=read_colmap_model(colmap), images=film)
+    # The same room, but its pictures in another order.
+    with pytest.raises(MapError, match=r"are not those of film.*--images"):
+        map_scene(Film(room[1][:3]), CAMERA, known=read_colmap_model(colmap), images=Film(room[1][::-1]))
+
+
+def test_a_map_of_given_poses_has_their_scale(room, poses, tmp_path):
+    scene = track(room, poses)
+    scene.save(tmp_path / "map.h5")
+    assert load_scene(tmp_path / "map.h5", CAMERA).map.has_given_lengths
+    save_trajectory(tmp_path / "trajectory.txt", scene.trajectory)
+    figures = evaluate_trajectory(tmp_path, poses)
+    assert figures["notes"] == []
+    assert figures["se3"]["absolute_mm"]["rmse"] < 1e3 * UNIT * 0.005
+
+
+def test_the_command_takes_known_maps(tmp_path, room, room_folder, colmap, refused):
     command = ["slam", str(room_folder / "film"), "--camera", str(room_folder / "camera.yaml"), "--no-video"]
-    for number, known in enumerate((["--trajectory", str(room_folder / "truth.txt")], ["--map", str(colmap)])):
+    write_film(tmp_path / "of_model", room[1])
+    model = ["--map", str(colmap), "--images", str(tmp_path / "of_model" / "film")]
+    for number, known in enumerate((["--trajectory", str(room_folder / "truth.txt")], model)):
         assert main([*command, *known, "--range", "36-39", "-o", str(tmp_path / str(number))]) == 0
         assert len(load_trajectory(tmp_path / str(number) / "trajectory.txt")) == 4
     save_trajectory(tmp_path / "poses.txt", load_trajectory(room_folder / "truth.txt"))

@@ -103,8 +103,57 @@ def test_what_does_not_fit_together_is_refused(with_depth):
         follow(Slam(CAMERA, with_depth=True), [frame.image], [{"depth": frame.depth[::2, ::2]}])
     with pytest.raises(CameraError, match="right image of frame 0 is 320x240"):
         follow(Slam(PAIR), [frame.image], [{"right": frame.image[::2, ::2]}])
-    with pytest.raises(MapError, match="baseline"):
+    with pytest.raises(MapError, match=r"baseline.*--no-depth"):
         Slam(PAIR, SlamOptions(extend=True)).use_map(RigidMap())
+
+
+def with_depth_times(film, factor, n=8):
+    """The first frames of a film as if its depth images had another unit."""
+    frames = film.frames[:n]
+    return Film([f.image for f in frames], [{"depth": np.float32(factor) * f.depth} for f in frames])
+
+
+def test_depths_out_of_reach_are_told_with_their_range(with_depth):
+    scene = map_scene(with_depth_times(with_depth, 100.0), CAMERA)
+    far = scene.frames[-1].reason.cause
+    assert far.reason is SlamReason.FAR_DEPTHS
+    # A disparity of 10 px at a baseline of 8 cm.
+    assert far.numbers[2] == pytest.approx(525.0 * 0.08 / 10.0)
+    known = 100.0 * with_depth.frames[7].depth
+    assert np.nanmin(known) <= far.numbers[0] < np.nanquantile(known, 0.1)
+    assert np.nanquantile(known, 0.9) < far.numbers[1] <= np.nanmax(known)
+    (flag,) = scene.summary()["flags"]
+    assert "--depth-per-metre" in flag
+
+
+@pytest.fixture(scope="module")
+def metric_map(with_depth, tmp_path_factory):
+    """The file of a map of the film."""
+    path = tmp_path_factory.mktemp("metric") / "map.h5"
+    map_scene(with_depth, CAMERA).save(path)
+    return path
+
+
+@pytest.mark.parametrize("extend", [False, True])
+@pytest.mark.parametrize("factor", [0.2, 0.95, 1.05, 5.0])
+def test_depth_of_another_scale_than_the_known_map_is_refused(with_depth, metric_map, extend, factor):
+    film, known = with_depth_times(with_depth, factor), load_scene(metric_map, CAMERA)
+    if 0.9 < factor < 1.1:
+        assert len(map_scene(film, CAMERA, SlamOptions(extend=extend), known=known).trajectory) == 8
+        return
+    with pytest.raises(MapError, match=f"contradict each other: measured depths are {factor:g}.* times"):
+        map_scene(film, CAMERA, SlamOptions(extend=extend), known=known)
+
+
+def test_a_map_is_not_overwritten_with_depth_of_another_scale(tmp_path, with_depth, refused):
+    camera = write_tum(tmp_path / "recording", with_depth.frames[:8])
+    run = tmp_path / "run"
+    command = ["slam", tmp_path / "recording", "--camera", camera, "--no-video", "-o", run]
+    assert main([str(word) for word in command]) == 0
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    wrong = ["--map", run / "map.h5", "--extend", "--overwrite", "--depth-per-metre", 1000]
+    assert "contradict" in refused(*command, *wrong)
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
 def write_tum(folder, film):

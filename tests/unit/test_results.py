@@ -116,6 +116,7 @@ def test_summary_counts_and_flags():
     assert summary["median_n_inliers"] == 280
     at_bound, lost, unobservable = notices_of(run)
     assert lost == RunNotice.of(RunWarning.LOST, count=1, n_frames=3)
+    assert "1 of 3 frames was lost" in lost.text
     data = {"parameter": "arch", "side": "upper", "bound": "60 mm", "count": 1}
     assert at_bound == RunNotice.of(RunWarning.AT_BOUND, **data)
     assert (unobservable.warning, unobservable.data["parameters"]) == (RunWarning.UNOBSERVABLE, ["skew"])

@@ -58,7 +58,7 @@ def test_corners_are_found_in_their_row_of_the_right_image(disparity):
     left, right = shifted_pair(disparity)
     corners = cv2.goodFeaturesToTrack(left, 150, 0.02, 8).reshape(-1, 2).astype(float)
     corners = corners[(corners[:, 0] > 100) & (corners[:, 0] < 300)]
-    pair = StereoImages(left, right)
+    pair = StereoImages(left, right, 50.0)
     found = corners[:, 0] - pair.right_columns(corners)
     measured = np.isfinite(found)
     assert measured.mean() > 0.7
@@ -70,7 +70,7 @@ def test_corners_are_found_in_their_row_of_the_right_image(disparity):
 def test_a_repeated_pattern_gives_no_depth_without_an_expectation():
     board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.ones((16, 16))).astype(np.uint8) * 150 + 50
     corners = np.array([[x, y] for x in (160.0, 192.0, 224.0) for y in (64.0, 96.0, 128.0)]) - 0.5
-    assert np.isnan(StereoImages(board, board).right_columns(corners)).all()
+    assert np.isnan(StereoImages(board, board, 50.0).right_columns(corners)).all()
 
 
 def test_depth_fixes_the_distance_that_pixels_leave_open():

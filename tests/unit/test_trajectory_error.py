@@ -137,13 +137,78 @@ def test_mistakes_in_paths_are_named(tmp_path):
     rows = np.column_stack([truth.timestamps, truth.positions, quaternions])
     np.savetxt(tmp_path / "truth.txt", rows, fmt="%.6f")
     (note,) = notes(good, load_trajectory(tmp_path / "truth.txt"))
-    assert "truth begin with qw" in note
+    assert "truth have quaternions that begin with qw" in note
     (note,) = notes(good, Trajectory(np.arange(61.0), truth.world_from_camera))
     assert "of 61 poses" in note
     assert "truth is stamped with whole numbers" in note
     (note,) = evaluate_trajectory(moved(good, 5.0), truth)["notes"]
     assert "5 times as large" in note
     assert "depth images" in note
+
+
+def swaying(n=120):
+    """A camera that sways and turns about all axes."""
+    time, poses = np.linspace(0.0, 1.0, n), np.tile(np.eye(4), (n, 1, 1))
+    waves = np.sin(2.0 * np.pi * np.outer(time, [0.9, 1.3, 0.7, 1.1, 0.8, 0.6]) + np.arange(6))
+    poses[:, :3, 3], poses[:, :3, :3] = 0.5 * waves[:, :3], Rotation.from_rotvec(0.4 * waves[:, 3:]).as_matrix()
+    return Trajectory(10.0 * time, poses)
+
+
+def with_noise(path, millimetres=1.0, degrees=0.05):
+    """A path with random errors."""
+    rng, poses = np.random.default_rng(0), moved(path).world_from_camera
+    poses[:, :3, 3] += 1e-3 * millimetres * rng.standard_normal((len(path), 3))
+    turns = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((len(path), 3)))
+    poses[:, :3, :3] = poses[:, :3, :3] @ turns.as_matrix()
+    return Trajectory(path.timestamps, poses)
+
+
+def seen_from_body(path, body):
+    """Poses of a body whose place in the camera's axes is ``body``."""
+    return Trajectory(path.timestamps, path.world_from_camera @ body)
+
+
+def test_a_truth_in_other_axes_is_named_with_the_turn():
+    truth, body = swaying(), np.eye(4)
+    estimate = with_noise(truth)
+    assert evaluate_trajectory(estimate, truth)["notes"] == []
+    (note,) = evaluate_trajectory(estimate, seen_from_body(truth, np.diag([1.0, -1.0, -1.0, 1.0])))["notes"]
+    assert "truth have the axes of OpenGL" in note
+    vector = np.array([20.0, -70.0, 45.0])
+    body[:3, :3] = Rotation.from_rotvec(vector, degrees=True).as_matrix()
+    (note,) = evaluate_trajectory(estimate, seen_from_body(truth, body))["notes"]
+    assert f"constant turn of {np.linalg.norm(vector):.1f} degrees" in note
+    found = [float(word) for word in note.split("rotation vector ")[1].split(" in camera")[0].split(",")]
+    assert found == pytest.approx(vector.tolist(), abs=0.3)
+
+
+@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (20.0, -70.0, 45.0)])
+def test_a_truth_of_a_point_beside_the_camera_is_named_with_the_lever(vector):
+    truth, body = swaying(), np.eye(4)
+    body[:3, :3] = Rotation.from_rotvec(vector, degrees=True).as_matrix()
+    body[:3, 3] = [0.06, -0.1, 0.12]
+    notes = evaluate_trajectory(with_noise(truth), seen_from_body(truth, body))["notes"]
+    assert len(notes) == 1 + any(vector)
+    found = [float(word) for word in notes[-1].split("(")[1].split(")")[0].split(",")]
+    # The camera's centre in the body's axes.
+    assert found == pytest.approx((1e3 * np.linalg.inv(body)[:3, 3]).tolist(), abs=3.0)
+
+
+def test_paths_that_drift_are_not_taken_for_those_of_another_body():
+    truth = swaying()
+    for seed in range(20):
+        rng, poses = np.random.default_rng(seed), [np.eye(4)]
+        for before, after in zip(truth.world_from_camera, truth.world_from_camera[1:], strict=False):
+            step = np.linalg.inv(before) @ after
+            step[:3, 3] += 0.001 * rng.standard_normal(3)
+            step[:3, :3] @= Rotation.from_rotvec(0.001 * rng.standard_normal(3)).as_matrix()
+            poses.append(poses[-1] @ step)
+        assert evaluate_trajectory(Trajectory(truth.timestamps, np.array(poses)), truth)["notes"] == []
+
+
+def test_stamps_in_nanoseconds_are_not_called_numbers_of_frames():
+    with pytest.raises(EvaluationError, match="the truth is stamped with nanoseconds"):
+        match(helix(), Trajectory(np.rint(1e9 * helix().timestamps), helix().world_from_camera))
 
 
 def test_published_figures_of_freiburg1_xyz():

@@ -24,7 +24,7 @@ from morph_dslam.evaluation.trajectory_notes import clock_advice, pair_notes, po
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.io.writing import writing
-from morph_dslam.slam.map_files import is_metric_map
+from morph_dslam.slam.map_files import has_known_scale
 
 Array = NDArray[np.float64]
 
@@ -263,9 +263,9 @@ def _trajectory_file(path: Path) -> Path:
 
 
 def _is_in_metres(path: Path) -> bool:
-    """Whether a trajectory's lengths may be metres: not those of a run whose map has no known scale."""
+    """Whether a trajectory's lengths may be metres: not those of a map whose scale nobody gave or measured."""
     rigid_map = path.with_name("map.h5")
-    return path.name != "trajectory.txt" or not rigid_map.is_file() or is_metric_map(rigid_map)
+    return path.name != "trajectory.txt" or not rigid_map.is_file() or has_known_scale(rigid_map)
 
 
 def _interval(trajectory: Trajectory) -> float:

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.geometry import fit_similarity, rotation_log
+from morph_dslam.io.trajectory import Trajectory, other_conventions
+from morph_dslam.slam.run_notes import LONGEST_INTERVAL_S
 from morph_dslam.sources.recorded import DEPTH_SCALE
 
 Array = NDArray[np.float64]
@@ -20,22 +22,107 @@ SPAN = 0.1
 FEW_PAIRS = 0.5
 #: Metric paths are alike in size up to this factor.
 ALIKE = 1.25
+#: Axes that differ by less are a matter of calibration, degrees. A lever is not worth a word below this error, metres.
+LEAST_AXES_DEG, LEAST_ERROR_M = 3.0, 0.002
+#: Differences of turns that are rounding, degrees; the least part of the largest singular value that tells.
+ROUNDING_DEG, LEAST_SINGULAR = 1e-6, 1e-2
 
 
 def pose_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
-    """What is wrong with the poses of matched paths, if those of one are of another convention."""
-    own, true = (path.world_from_camera[:, :3, :3] for path in (estimate, truth))
-    given = _turn_difference(own, true)
-    others = {
-        "the poses of one path are inverted, camera from world: save them as world from camera": (
-            _turn_difference(own, true.transpose(0, 2, 1))
-        ),
-        "the quaternions of the truth begin with qw: write qx qy qz qw": _turn_difference(own, _with_w_first(true)),
-        "the quaternions of the estimate begin with qw: write qx qy qz qw": _turn_difference(_with_w_first(own), true),
-    }
-    text = min(others, key=lambda name: others[name])
-    if given > max(CLEARLY * others[text], LEAST_DEG):
-        yield f"{text}; the turns of the paths then differ by {others[text]:.2g} degrees, not by {given:.2g}"
+    """What is wrong with the poses of matched paths, if those of one are of another convention or another body.
+
+    What only turns the axes of every pose alike is named after what a convention explains. With that, the truth may be
+    of a point beside the camera's centre.
+    """
+    given = _turn_difference(estimate, truth)
+    text, own, true = _best_convention(estimate, truth)
+    after = _turn_difference(own, true)
+    if not given > max(CLEARLY * after, LEAST_DEG):
+        text, own, true, after = "", estimate, truth, given
+    axes = _axes_of_body(own, true)
+    angle, turned = float(np.degrees(Rotation.from_matrix(axes).magnitude())), _turned(own, axes)
+    if angle > LEAST_AXES_DEG and after > max(CLEARLY * _turn_difference(turned, true), LEAST_DEG):
+        named = ", ".join(f"{value:.4g}" for value in np.degrees(rotation_log(axes)))
+        text = (
+            f"the axes of the truth's poses differ from those of the camera (x right, y down, z forward) by a constant "
+            f"turn of {angle:.1f} degrees, rotation vector {named} in camera axes: it is the path of another body that "
+            "the camera sits on, or has other axes. Multiply its rotations by the inverse turn from the right"
+        )
+        own, after = turned, _turn_difference(turned, true)
+    if text:
+        yield f"{text}; the turns of the paths then differ by {after:.2g} degrees, not by {given:.2g}"
+    yield from _lever_notes(own, true)
+
+
+def _best_convention(estimate: Trajectory, truth: Trajectory) -> tuple[str, Trajectory, Trajectory]:
+    """What another convention of one path would be said to be, and both paths with it, which turn most alike.
+
+    Turns about one axis may not tell conventions apart; then the positions do, and else the truth's is meant.
+    """
+    ways = [
+        (f"the poses of the truth {text}", estimate, Trajectory(truth.timestamps, poses))
+        for text, poses in other_conventions(truth.world_from_camera).items()
+    ] + [
+        (f"the poses of the estimate {text}", Trajectory(estimate.timestamps, poses), truth)
+        for text, poses in other_conventions(estimate.world_from_camera).items()
+    ]
+    turns = np.array([_turn_difference(own, true) for _, own, true in ways])
+    alike = np.flatnonzero(turns <= CLEARLY * turns.min() + ROUNDING_DEG)
+    errors = np.array([_position_error(*ways[row][1:]) for row in alike])
+    return ways[alike[np.flatnonzero(errors <= CLEARLY * errors.min())[0]]]
+
+
+def _position_error(estimate: Trajectory, truth: Trajectory) -> float:
+    """Root mean square distance of the centres after the best similarity; infinite where there is none."""
+    try:
+        motion = fit_similarity(estimate.positions, truth.positions, with_scale=True)
+    except ValueError:
+        return np.inf
+    return float(np.sqrt(np.mean(np.sum((motion.apply(estimate.positions) - truth.positions) ** 2, axis=1))))
+
+
+def _axes_of_body(estimate: Trajectory, truth: Trajectory) -> Array:
+    """The turn (3, 3) camera_from_body for which the body's turns are most like the camera's.
+
+    A turn seen in other axes has its rotation vector in these axes. Turns about one axis alone leave it open: none.
+    """
+    own, true = (
+        Rotation.from_matrix(_turns(path.world_from_camera[:, :3, :3])).as_rotvec() for path in (estimate, truth)
+    )
+    u, sizes, vt = np.linalg.svd(own.T @ true)
+    is_known = sizes[1] > LEAST_SINGULAR * sizes[0]
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt if is_known else np.eye(3)
+
+
+def _turned(path: Trajectory, axes: Array) -> Trajectory:
+    """A path with the axes of its poses turned (3, 3)."""
+    poses = path.world_from_camera.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ axes
+    return Trajectory(path.timestamps, poses)
+
+
+def _lever_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
+    """That the truth is of a point beside the camera's centre, if that explains most of the difference.
+
+    With axes that agree, truth + R lever = scale world_turn estimate + shift is linear in lever, scale and shift.
+    """
+    rotations = truth.world_from_camera[:, :3, :3]
+    turn = Rotation.from_matrix(rotations @ estimate.world_from_camera[:, :3, :3].transpose(0, 2, 1)).mean()
+    moved = turn.apply(estimate.positions - estimate.positions.mean(axis=0))
+    moved /= max(float(np.abs(moved).max()), 1e-12)
+    n = len(rotations)
+    columns = [-rotations.reshape(-1, 3), moved.reshape(-1, 1), np.tile(np.eye(3), (n, 1))]
+    values, _, rank, _ = np.linalg.lstsq(np.hstack(columns), truth.positions.ravel(), rcond=LEAST_SINGULAR)
+    if rank < len(values):  # the path does not turn enough to tell
+        return
+    left = np.hstack(columns) @ values - truth.positions.ravel()
+    after, before = float(np.sqrt(left @ left / n)), _position_error(estimate, truth)
+    if before > max(CLEARLY * after, LEAST_ERROR_M) and float(values[3]) > 0.0:
+        lever = ", ".join(f"{value:.0f}" for value in 1e3 * values[:3])
+        yield (
+            f"the camera's centre is ({lever}) mm from the point whose path the truth is, in the truth's axes; with it "
+            f"the positions differ by {1e3 * after:.2g} mm, not by {1e3 * before:.2g}"
+        )
 
 
 def pair_notes(n_pairs: int, estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
@@ -51,7 +138,9 @@ def clock_advice(estimate: Trajectory, truth: Trajectory) -> str:
     """What to do if few poses of the paths belong together in time."""
     whole = [bool((path.timestamps % 1.0 == 0.0).all()) for path in (estimate, truth)]
     if whole[0] != whole[1]:
-        numbered = "estimate" if whole[0] else "truth"
+        numbered, path = ("estimate", estimate) if whole[0] else ("truth", truth)
+        if len(path) > 1 and np.median(np.diff(path.timestamps)) > LONGEST_INTERVAL_S:
+            return f"the {numbered} is stamped with nanoseconds or microseconds probably: stamp it with seconds"
         return f"the {numbered} is stamped with whole numbers, of frames probably: stamp it with seconds"
     return "give the truth of this recording, on its clock"
 
@@ -67,18 +156,18 @@ def size_notes(scale: float, rigid_rmse: float, similar_rmse: float) -> Iterator
     if not 1.0 / ALIKE < scale < ALIKE and similar_rmse < 0.5 * rigid_rmse:
         yield (
             f"the true path is {scale:.4g} times as large as the estimated one: in a metric map correct {DEPTH_SCALE}, "
-            "or the baseline of the stereo pair"
+            "the baseline of the stereo pair, or the unit of the poses that it was made with"
         )
 
 
-def _turn_difference(first: Array, second: Array) -> float:
-    """Root mean square difference between the turns of two series of rotations (n, 3, 3), degrees."""
-    step = max(1, int(SPAN * len(first)))
-    turns = [rotations[:-step].transpose(0, 2, 1) @ rotations[step:] for rotations in (first, second)]
-    angles = Rotation.from_matrix(turns[0].transpose(0, 2, 1) @ turns[1]).magnitude()
+def _turns(rotations: Array) -> Array:
+    """Turns (m, 3, 3) over `SPAN` of a series of rotations (n, 3, 3), by their own axes."""
+    step = max(1, int(SPAN * len(rotations)))
+    return rotations[:-step].transpose(0, 2, 1) @ rotations[step:]
+
+
+def _turn_difference(first: Trajectory, second: Trajectory) -> float:
+    """Root mean square difference between the turns of two paths, degrees."""
+    own, true = (_turns(path.world_from_camera[:, :3, :3]) for path in (first, second))
+    angles = Rotation.from_matrix(own.transpose(0, 2, 1) @ true).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angles**2))))
-
-
-def _with_w_first(rotations: Array) -> Array:
-    """What (n, 3, 3) their files meant if the quaternions in these begin with qw."""
-    return Rotation.from_quat(np.roll(Rotation.from_matrix(rotations).as_quat(), -1, axis=1)).as_matrix()

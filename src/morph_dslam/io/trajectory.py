@@ -82,6 +82,21 @@ def load_trajectory(path: Path) -> Trajectory:
     return _make(path, _table_rows(path, lines))
 
 
+def other_conventions(world_from_camera: Array) -> dict[str, Array]:
+    """What poses (n, 4, 4) are if they were written by another convention, by what to say of them: "they ..."."""
+    backwards, turned = np.diag([1.0, -1.0, -1.0, 1.0]), world_from_camera.copy()
+    w_last = np.roll(Rotation.from_matrix(world_from_camera[:, :3, :3]).as_quat(), -1, axis=1)
+    turned[:, :3, :3] = Rotation.from_quat(w_last).as_matrix()
+    return {
+        "are inverted, camera from world: save them as world from camera": np.linalg.inv(world_from_camera).astype(
+            np.float64
+        ),
+        "have the axes of OpenGL (x right, y up, z backwards): multiply their rotations by diag(1, -1, -1) from the "
+        "right": world_from_camera @ backwards,
+        "have quaternions that begin with qw: write qx qy qz qw": turned,
+    }
+
+
 def save_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a TUM file that `load_trajectory` and other programs read."""
     lines = ["# timestamp tx ty tz qx qy qz qw"]

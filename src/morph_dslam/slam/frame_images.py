@@ -156,6 +156,10 @@ class FrameDepth(Protocol):
         """Columns (n,) of pixels (n, 2) in the right image, NaN if not measured or not near ``expected``."""
         ...
 
+    def at(self, pixels: Array) -> Array:
+        """Depths (n,) of pixels (n, 2), metres, NaN where not measured, whatever the map expects."""
+        ...
+
     def samples(self) -> NDArray[np.float32]:
         """Column, row and depth (m, 3), metres, of pixels spread over the image, where they are measured anyway."""
         ...
@@ -190,6 +194,15 @@ class DepthImage:
         result[rows[smooth]] = (pixels[rows, 0] - (weights * disparity).sum(axis=0))[smooth]
         return _near(result, expected)
 
+    def at(self, pixels: Array) -> Array:
+        """As `FrameDepth` says, of the nearest pixel."""
+        height, width = self.depth.shape
+        columns, rows = np.rint(pixels).astype(int).T
+        seen = (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
+        result = np.full(len(pixels), np.nan)
+        result[seen] = self.depth[rows[seen], columns[seen]]
+        return result
+
     def samples(self) -> NDArray[np.float32]:
         """As `FrameDepth` says; none next to edges and holes."""
         height, width = self.depth.shape
@@ -205,6 +218,7 @@ class StereoImages:
 
     left: Image
     right: Image
+    baseline_px: float
 
     def right_columns(self, pixels: Array, expected: Array | None = None) -> Array:
         """As `FrameDepth` says: the place in the row that looks most alike, refined by Lucas-Kanade."""
@@ -221,6 +235,10 @@ class StereoImages:
         good &= (likeness > LEAST_CORRELATION) & (np.abs(found[:, 1] - seen[:, 1]) < MOST_ROW_ERROR)
         result[rows[good]] = found[good, 0]
         return _near(result, expected)
+
+    def at(self, pixels: Array) -> Array:
+        """As `FrameDepth` says."""
+        return depth_of(pixels, self.right_columns(pixels), self.baseline_px)
 
     def samples(self) -> NDArray[np.float32]:
         """None: each pixel would have to be searched."""
@@ -343,7 +361,7 @@ class FrameImages:
             if right is None:
                 return None
             right = self._grey(right, f"the right image of frame {index}", self._right_maps)
-            return StereoImages(normalized, normalize_contrast(right))
+            return StereoImages(normalized, normalize_contrast(right), self.baseline_px)
         if depth is None:
             return None
         self.camera.check_image(depth, f"the depth image of frame {index}")

@@ -19,11 +19,13 @@ from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.frame_images import FrameImages, FrameView
+from morph_dslam.slam.given_poses import PoseCheck
 from morph_dslam.slam.mapping import Mapper, do_all
 from morph_dslam.slam.options import INLIER_PX, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, inside, inverse, reprojection_errors
 from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
-from morph_dslam.slam.tracking import Tracked, Tracker
+from morph_dslam.slam.templates import image_pyramid
+from morph_dslam.slam.tracking import Tracked, Tracker, ViewsOf
 from morph_dslam.sources import FrameSource
 from morph_dslam.tracking.patches import LEVELS
 
@@ -45,8 +47,10 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
     Raises MapError if fewer than three frames have a pose, or too few points obey the poses.
     """
     rigid_map = RigidMap()
+    rigid_map.has_given_lengths = True
     mapper = Mapper(rigid_map, images.camera, hold_poses=True, unknown_depth=FAR * trajectory.length)
     tracker = _PosedTracker(rigid_map, images.camera)
+    check = PoseCheck(trajectory.world_from_camera, np.asarray(images.camera.intrinsics))
     times, n_posed = [], 0
     for frame in source:
         times.append(frame.timestamp)
@@ -56,6 +60,7 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
         n_posed += 1
         pose = inverse(trajectory.world_from_camera[nearest])
         view = images.prepare(frame.image, frame.index, frame.timestamp)
+        check.add(view, nearest)
         if not rigid_map.keyframes:
             mapper.begin_at(view, pose)
             tracker.place(pose, rigid_map.keyframes[-1].seen)
@@ -64,13 +69,20 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
         if mapper.wants_keyframe(tracked, view.index):
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
-    _check(trajectory, source, n_posed, times, rigid_map)
+    _check(trajectory, source, n_posed, times, rigid_map, check.fault())
     mapper.complete()
     return rigid_map
 
 
-def _check(trajectory: Trajectory, source: FrameSource, n_posed: int, times: list[float], rigid_map: RigidMap) -> None:
-    """Refuse what gives no map."""
+def _check(
+    trajectory: Trajectory,
+    source: FrameSource,
+    n_posed: int,
+    times: list[float],
+    rigid_map: RigidMap,
+    fault: str | None,
+) -> None:
+    """Refuse what gives no map, or a wrong one; ``fault``: of the poses."""
     if n_posed < 3:
         raise MapError(
             f"only {n_posed} of {len(times)} frames of {source.name} have a pose: they are from "
@@ -78,10 +90,12 @@ def _check(trajectory: Trajectory, source: FrameSource, n_posed: int, times: lis
             f"{trajectory.timestamps[-1]:.3f} s, and may differ by {1e3 * MOST_TIME_DIFFERENCE:.0f} ms"
         )
     share = float(rigid_map.n_found.sum() / max(rigid_map.n_expected.sum(), 1))
+    misfit = f"the poses of the trajectory do not fit the images of {source.name}"
+    if fault:
+        raise MapError(f"{misfit}: they {fault}")
     if share < LEAST_FOUND or len(rigid_map.good) < LEAST_START_POINTS:
         raise MapError(
-            f"the poses of the trajectory do not fit the images of {source.name}: "
-            f"{len(rigid_map.good)} points were made, found again in {share:.0%} of the frames. Check that "
+            f"{misfit}: {len(rigid_map.good)} points were made, found again in {share:.0%} of the frames. Check that "
             "poses are world from camera (x right, y down, z forward) at the frames' timestamps, that most "
             "frames have one, and the camera file"
         )
@@ -119,6 +133,7 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["camera_notes"] = json.dumps(rigid_map.camera_notes)
         file.attrs["baseline_px"] = rigid_map.baseline_px
+        file.attrs["has_given_lengths"] = rigid_map.has_given_lengths
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
         file.attrs.update({"distortion": camera.distortion, "lens_model": camera.lens_model})
         file.attrs["readout_s"] = camera.readout_s
@@ -151,10 +166,13 @@ def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Traje
         return _read(path, file, camera), Trajectory(*path_of_run) if path_of_run else none
 
 
-def is_metric_map(path: Path) -> bool:
-    """Whether the lengths of a map are metres; raises MapError if it is missing or damaged, or of another version."""
+def has_known_scale(path: Path) -> bool:
+    """Whether the lengths of a map are metres, or those of given poses.
+
+    Raises MapError if it is missing or damaged, or of another version.
+    """
     with _opened(path) as file:
-        return RigidMap(float(np.asarray(file.attrs["baseline_px"]))).is_metric
+        return RigidMap(float(np.asarray(file.attrs["baseline_px"]))).is_metric or _has_given_lengths(file)
 
 
 @contextmanager
@@ -215,12 +233,18 @@ def _lens_note(path: Path, file: h5py.File, camera: Camera) -> tuple[str, ...]:
     )
 
 
+def _has_given_lengths(file: h5py.File) -> bool:
+    """Whether the lengths of a map are those of given poses; maps of earlier releases do not say."""
+    return bool(np.asarray(file.attrs.get("has_given_lengths", False)))
+
+
 def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     _check_camera(path, file, camera)
     keyframes = file.get("keyframes")
     if not isinstance(keyframes, h5py.Group):
         raise MapError(f"{path} is empty: the run that wrote it never began a map")
     rigid_map = RigidMap(float(np.asarray(file.attrs["baseline_px"])))
+    rigid_map.has_given_lengths = _has_given_lengths(file)
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
     notes = json.loads(str(file.attrs.get("camera_notes", "[]")))
     rigid_map.camera_notes = (*notes, *_lens_note(path, file, camera))
@@ -236,6 +260,9 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     return rigid_map
 
 
+#: Points of a model look alike in two of its pictures at least in this share of cases: nine tenths in right pictures, a
+#: twentieth by chance.
+LEAST_ALIKE = 0.2
 #: Observations that miss their points by more are left out; if half of them do, the cameras differ.
 MOST_ERROR_PX = 4.0
 
@@ -269,7 +296,29 @@ def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages
             "the camera that it was made with (--camera MODEL/cameras.txt), and its own images with --images"
         )
     rigid_map.remove(np.flatnonzero(rigid_map.n_observations() < 1))
+    _check_pictures(rigid_map, images.camera, source)
     return rigid_map
+
+
+def _check_pictures(rigid_map: RigidMap, camera: Camera, source: FrameSource) -> None:
+    """Refuse pictures that are not the model's: its points look alike in no two of them."""
+    tracker, n_seen, n_found = Tracker(rigid_map, camera), 0, 0
+    for number in range(1, len(rigid_map.keyframes)):
+        keyframe = rigid_map.keyframes[number]
+        shared = rigid_map.shared_points(keyframe.point_ids)[:number]
+        other = rigid_map.keyframes[int(shared.argmax())]
+        views = ViewsOf(rigid_map, np.array([shared.argmax()]))
+        seen = keyframe.seen[np.isin(keyframe.point_ids, other.point_ids)]
+        seen = seen[tracker.is_similar_view(seen.ids, keyframe.camera_from_world, views)]
+        found = tracker.find(image_pyramid(keyframe.normalized), seen, keyframe.camera_from_world, 1, views)
+        rows, _ = keyframe.rows_of(found.ids)
+        n_seen += len(seen.ids)
+        n_found += int((np.linalg.norm(found.pixels - keyframe.pixels[rows], axis=1) < MOST_ERROR_PX).sum())
+    if n_seen >= LEAST_START_POINTS and n_found < LEAST_ALIKE * n_seen:
+        raise MapError(
+            f"the images of the COLMAP model are not those of {source.name}: only {n_found / n_seen:.0%} of its points "
+            "look alike in two images. Give the recording that it was made from with --images"
+        )
 
 
 def _add_keyframe(

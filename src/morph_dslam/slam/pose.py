@@ -367,8 +367,8 @@ def _score(squared_errors: Array, limit: float) -> float:
     return float(np.sum(np.where(squared_errors < limit, CHI2_TWO - squared_errors, 0.0)))
 
 
-def _epipolar_errors(essential: Array, first: Array, second: Array, intrinsics: Array) -> tuple[Array, Array]:
-    """Squared distances (n,) to the epipolar lines in either image, px^2."""
+def epipolar_errors(essential: Array, first: Array, second: Array, intrinsics: Array) -> tuple[Array, Array]:
+    """Squared distances (n,) of matched pixels (n, 2) to their epipolar lines in either image, px^2."""
     inverse = np.linalg.inv(camera_matrix(intrinsics))
     fundamental = inverse.T @ essential @ inverse
     a, b = np.column_stack([first, np.ones(len(first))]), np.column_stack([second, np.ones(len(second))])
@@ -398,7 +398,7 @@ def two_view_hypotheses(first: Array, second: Array, intrinsics: Array) -> list[
     if essential is None or homography is None or essential.shape != (3, 3):
         return []
     essential, homography = np.asarray(essential, dtype=float), np.asarray(homography, dtype=float)
-    by_lines = sum(_score(e, CHI2_ONE) for e in _epipolar_errors(essential, first, second, intrinsics))
+    by_lines = sum(_score(e, CHI2_ONE) for e in epipolar_errors(essential, first, second, intrinsics))
     by_plane = sum(_score(e, CHI2_TWO) for e in _transfer_errors(homography, first, second))
     if by_plane > PLANE_SHARE * (by_plane + by_lines):
         _, rotations, shifts, _ = cv2.decomposeHomographyMat(homography, matrix)

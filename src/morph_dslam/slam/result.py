@@ -46,6 +46,7 @@ class SlamReason(Enum):
     FIRST_MAP_FAILED = "the first map did not hold"
     NO_DEPTH = "this frame has no depth"
     FEW_DEPTHS = "only {} corners with depth, {} are needed"
+    FAR_DEPTHS = "it has depths of {:.3g} to {:.3g} m, of which those up to {:.2g} m count"
     FEW_POINTS = "only {} map points were found in this frame"
     FEW_INLIERS = "only {} of {} map points agree on a pose"
     RIVAL_MOTIONS = "two parts of the scene move apart, and which of them stands still is ambiguous"

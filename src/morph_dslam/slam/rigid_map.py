@@ -245,6 +245,7 @@ class RigidMap:
     usual_rms_px : running mean of the errors of the poses found in it.
     baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
         measured, and lengths are in map units instead of metres.
+    has_given_lengths : whether lengths are those of poses that were given.
     passing : frames that are not kept, but tell which candidates move.
     camera_notes : what its recording showed to be wrong with its camera, for people.
     """
@@ -254,6 +255,7 @@ class RigidMap:
         self.keyframes: list[Keyframe] = []
         self.usual_rms_px = FIRST_RMS_PX
         self.camera_notes: tuple[str, ...] = ()
+        self.has_given_lengths = False
         self.passing = PassingViews()
         self.positions = np.empty((0, 3))
         self.state = np.empty(0, dtype=np.int8)

@@ -131,6 +131,9 @@ def run_slam(
                 for frame in track_frames(slam, stream, progress, watch):
                     frames.append(frame)
             again = stream if isinstance(stream, FrameSource) and known is None else None
+        except MapError:
+            frames.clear()  # nothing of a run whose depth contradicts the map may replace an earlier one
+            raise
         except SourceError as error:
             if not frames:
                 raise

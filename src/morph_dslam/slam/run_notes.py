@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.slam.result import SlamFrame, SlamStatus
+from morph_dslam.slam.result import NoPose, SlamFrame, SlamReason, SlamStatus
 from morph_dslam.slam.rolling_shutter import LEAST_GAP_S
 from morph_dslam.slam.slam import Slam
+from morph_dslam.sources.recorded import DEPTH_SCALE
 
 #: So many frames are named, of more their number.
 MOST_NAMED = 5
@@ -31,16 +32,17 @@ def run_notes(slam: Slam, frames: Sequence[SlamFrame], after: Sequence[SlamFrame
     """
     n_lost = sum(frame.status is SlamStatus.LOST for frame in after)
     if n_lost:
-        yield f"{n_lost} frames after the start were lost: frames.csv says why"
+        yield f"{_counted(n_lost, 'frame')} after the start {_were(n_lost)} lost: frames.csv says why"
     if slam.n_restarts:
-        yield f"{slam.n_restarts} young maps were lost for too long and given up, with their poses"
+        n = slam.n_restarts
+        yield f"{_counted(n, 'young map')} {_were(n)} lost for too long and given up, with {_its(n)} poses"
     if frames and not after:
         what = "the camera was found in no frame of this map" if slam.knows_map else "no map was begun"
-        yield f"{what}: {frames[-1].reason}"
+        yield f"{what}: {frames[-1].reason}{_depth_advice(frames[-1].reason)}"
     if slam.n_depths_aside:
         yield (
-            f"{slam.n_depths_aside} depth images are not registered to the colour and were not used: docs/sources.md "
-            "says how to register them"
+            f"{_counted(slam.n_depths_aside, 'depth image')} not registered to the colour {_were(slam.n_depths_aside)} "
+            "not used: docs/sources.md says how to register depth"
         )
     yield from time_notes(frames, slam.camera.readout_s)
 
@@ -67,11 +69,11 @@ def time_notes(frames: Sequence[SlamFrame], readout_s: float = 0.0) -> Iterator[
     same, back = np.abs(gaps) < LEAST_GAP_S, gaps <= -LEAST_GAP_S
     if same.any():
         yield (
-            f"frames {_named(numbers[same])} have the timestamp of the frame before: write timestamps with three "
-            "decimals at least, or leave out frames that are there twice"
+            f"{_named(numbers[same])} {'has' if same.sum() == 1 else 'have'} the timestamp of the frame before: write "
+            "timestamps with three decimals at least, or leave out frames that are there twice"
         )
     if back.any():
-        yield f"the timestamps go back at frames {_named(numbers[back])}: the order of the frames is kept"
+        yield f"the timestamps go back at {_named(numbers[back])}: the order of the frames is kept"
     if abs(readout_s) > (1.0 + READOUT_ABOVE_INTERVAL) * interval and interval > LEAST_GAP_S:
         yield (
             f"readout_s of the camera file, {abs(readout_s):g} s, is longer than the time between frames, "
@@ -79,7 +81,29 @@ def time_notes(frames: Sequence[SlamFrame], readout_s: float = 0.0) -> Iterator[
         )
 
 
+def _counted(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _were(n: int) -> str:
+    return "was" if n == 1 else "were"
+
+
+def _its(n: int) -> str:
+    return "its" if n == 1 else "their"
+
+
+def _depth_advice(reason: NoPose | None) -> str:
+    """What to do where the depths of a frame are too large, for the end of a sentence."""
+    is_far = reason is not None and reason.cause is not None and reason.cause.reason is SlamReason.FAR_DEPTHS
+    return f". If the scene is nearer, correct --depth-per-metre, {DEPTH_SCALE}" if is_far else ""
+
+
 def _named(numbers: NDArray[np.integer]) -> str:
     """The first of them, and how many more there are."""
     more = len(numbers) - MOST_NAMED
-    return ", ".join(str(number) for number in numbers[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return (
+        ("frame " if len(numbers) == 1 else "frames ")
+        + ", ".join(str(number) for number in numbers[:MOST_NAMED])
+        + (f" and {more} more" if more > 0 else "")
+    )

@@ -22,6 +22,7 @@ from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.camera_notes import camera_notes
+from morph_dslam.slam.depth_scale import check_depth_ratio
 from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
@@ -234,11 +235,15 @@ def start_slam(
 def track_frames(
     slam: Slam, source: FrameStream, progress: bool = False, watch: Watch | None = None
 ) -> Iterator[SlamFrame]:
-    """Records of all frames, one after the other; parameters as of `map_scene`."""
+    """Records of all frames, one after the other; parameters as of `map_scene`.
+
+    Raises MapError if measured depths contradict a known map.
+    """
     total = len(source) if isinstance(source, Sized) else None
     with threads_side_by_side() if slam.threaded else nullcontext():
         for frame in tqdm(source, total=total, desc="tracking", unit="frame", disable=not progress):
             result = slam.process_frame(frame.image, frame.index, frame.timestamp, frame.depth, frame.right)
+            check_depth_ratio(slam.depth_ratio)
             if watch is not None:
                 watch(slam.undistort(frame.image), result)
             yield result.record(is_final=slam.is_frozen and not slam.camera.readout_s)

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
-from morph_dslam.slam.frame_images import FrameImages, FrameView
+from morph_dslam.slam.depth_scale import depth_ratio
+from morph_dslam.slam.frame_images import FrameDepth, FrameImages, FrameView
 from morph_dslam.slam.initialization import MapInitializer, MapStart
 from morph_dslam.slam.least_squares_matching import moved_along
-from morph_dslam.slam.local_map import WINDOW
+from morph_dslam.slam.local_map import LEAST_DISPARITY_PX, WINDOW
 from morph_dslam.slam.map_making import MapMaking
 from morph_dslam.slam.mapping import pose_in_keyframe
 from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS, LEAST_START_POINTS, SlamOptions
-from morph_dslam.slam.pose import refine_pose
+from morph_dslam.slam.pose import project, refine_pose
 from morph_dslam.slam.relocalization import Relocalizer
 from morph_dslam.slam.result import STAGES, NoPose, SlamFrame, SlamReason, SlamStatus
 from morph_dslam.slam.rigid_map import CANDIDATE, NOWHERE, Followed, RigidMap
@@ -59,6 +60,7 @@ class Slam:
     frozen_at : frame from which on it froze because the scene deformed, or None
     n_known : keyframes of a map that was known before
     n_depths_aside : depth images that were not used because they do not belong to the colour pixels
+    depth_ratio : measured depths over those of a map that was known before, once a frame told; None before
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class Slam:
         self.is_frozen, self.frozen_at = False, None
         self.n_restarts, self.threaded = 0, threaded
         self.n_known, self.n_depths_aside = 0, 0
+        self.depth_ratio: float | None = None
         self._expects_depth = with_depth or self.frame_images.is_stereo or not self.options.use_depth
         self._begin(RigidMap(self.frame_images.baseline_px))
 
@@ -91,6 +94,7 @@ class Slam:
                     "a map can only be extended by the kind of camera that made it: its depth comes from "
                     f"{_origin_of(rigid_map.baseline_px)}, "
                     f"this camera's from {_origin_of(self.frame_images.baseline_px)}"
+                    f"{_remedy(rigid_map.baseline_px)}"
                 )
             # The map's own depths are enough to find the camera in it.
             self.frame_images.baseline_px = 0.0
@@ -160,6 +164,8 @@ class Slam:
             with stage("map"):
                 self._making.advance()
             frame = self._locate(view)
+            if self.knows_map and self.depth_ratio is None:
+                self.depth_ratio = self._compared_depth(view, frame)
             if not self.is_frozen:
                 self._making.end_frame()
             self._n_lost = self._n_lost + 1 if frame.status is SlamStatus.LOST else 0
@@ -243,6 +249,14 @@ class Slam:
         )
         return estimate.camera_from_world if estimate.inliers.sum() >= LEAST_INLIERS else start
 
+    def _compared_depth(self, view: FrameView, frame: SlamFrame) -> float | None:
+        """Measured depths of a frame over those of the map; None where they do not tell."""
+        if view.depth is None or frame.pose is None:
+            return None
+        positions = self.map.positions[frame.points.ids]
+        _, depths = project(frame.pose.camera_from_world, positions, self.camera.intrinsics)
+        return depth_ratio(view.depth, frame.points.pixels, depths)
+
     def _locate(self, view: FrameView) -> SlamFrame:
         if not self.map.keyframes:
             return self._start(view)
@@ -273,8 +287,15 @@ class Slam:
         n = self._making.begin_at(view, np.eye(4))
         if n < LEAST_START_POINTS:
             self._begin(RigidMap(self.frame_images.baseline_px))
-            return NoPose(SlamReason.FEW_DEPTHS, (n, LEAST_START_POINTS))
+            return NoPose(SlamReason.FEW_DEPTHS, (n, LEAST_START_POINTS), self._out_of_reach(view.depth))
         return self.map.keyframes[-1].seen
+
+    def _out_of_reach(self, depth: FrameDepth) -> NoPose | None:
+        """That most depths of a frame are too large to place points by, if they are."""
+        depths, most = depth.samples()[:, 2], self.frame_images.baseline_px / LEAST_DISPARITY_PX
+        if not len(depths) or np.median(depths) < most:
+            return None
+        return NoPose(SlamReason.FAR_DEPTHS, (float(depths.min()), float(depths.max()), most))
 
     def _track(self, view: FrameView) -> SlamFrame:
         with stage("track"):
@@ -341,3 +362,10 @@ class Slam:
 
 def _origin_of(baseline_px: float) -> str:
     return f"a baseline of {baseline_px:.1f} px m" if baseline_px else "the motion of one camera alone"
+
+
+def _remedy(map_baseline_px: float) -> str:
+    """What to do with a map of other depth, for the end of a sentence."""
+    if map_baseline_px:
+        return ": leave out --extend to find the camera in it, or map again"
+    return ": leave depth images aside with --no-depth, or use the left camera of a pair alone"

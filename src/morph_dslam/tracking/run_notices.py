@@ -22,7 +22,7 @@ from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, FLOOR_PX, UNEX
 class RunWarning(StrEnum):
     """What may be wrong with a run; the texts are filled in by `RunNotice`."""
 
-    LOST = "{count} of {n_frames} frames were lost; their reasons are in frames.csv"
+    LOST = "{count} of {n_frames} frames {were} lost; their reasons are in frames.csv"
     HIDDEN = (
         "the object was hidden in {count} of {n_frames} frames: its pose there is the map's, its parameters are not "
         "known"
@@ -32,7 +32,7 @@ class RunWarning(StrEnum):
         "or inside of it, is not seen"
     )
     MOVED = (
-        "the object has moved from its place in the map in {count} frames, first in frame {first}: there its points "
+        "the object has moved from its place in the map in {count} {frames}, first in frame {first}: there its points "
         "alone give its pose; register it again to use the map"
     )
     MODEL_FAILS = (
@@ -65,14 +65,14 @@ class RunWarning(StrEnum):
         "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that"
     )
     AT_BOUND = (
-        "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} frames: the object may be "
+        "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} {frames}: the object may be "
         "outside what the model covers; widen the range in the study and build again"
     )
     UNOBSERVABLE = "{statement}"
     REREGISTERED = "registered anew in frame {frame}"
     NOT_REREGISTERED = "not registered anew in frame {frame}: {why}"
     SAME_PICTURE = (
-        "the camera delivered exactly the same picture again in {count} frames, first in frame {first}, for up to "
+        "the camera delivered exactly the same picture again in {count} {frames}, first in frame {first}, for up to "
         "{longest_s:.1f} s: it, or what sends its pictures, may have been frozen; results there say nothing of the "
         "object"
     )
@@ -105,7 +105,9 @@ class RunNotice(Notice):
 
     @property
     def text(self) -> str:
-        return self.warning.value.format(**self.data)
+        one = self.data.get("count") == 1
+        frames, were = ("frame", "was") if one else ("frames", "were")
+        return self.warning.value.format(**self.data, frames=frames, were=were)
 
     def content(self) -> dict[str, Any]:
         return {"kind": self.kind, **self.data, "text": self.text}
