@@ -98,6 +98,15 @@ BENCHMARKS = {
         "As they are, with the reference state refined over the sequence (`--refine`), and corrected by the sheet's "
         "outline in their frame (`--snap`).",
     ),
+    "rolling_shutter": Benchmark(
+        "Tracking",
+        "The rubber mat, shaken before a rolling shutter",
+        "python benchmarks/rolling_shutter.py",
+        SAME_MODEL,
+        f"{NOISE}; a readout time of 30 ms",
+        1,
+        "By a global shutter, by a rolling one whose readout time is stated, and by one whose is not.",
+    ),
     "studio_clicks": Benchmark(
         "Tracking",
         "The rubber mat from clicks in the studio",

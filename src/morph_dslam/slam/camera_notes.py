@@ -9,8 +9,11 @@ import numpy as np
 from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, TermEstimate
 
 
-def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
-    """What a reader of a run must know of its camera, whose terms were all estimated."""
+def camera_notes(estimate: CameraEstimate, deforms: bool = False) -> Iterator[str]:
+    """What a reader of a run must know of its camera, whose terms were all estimated.
+
+    ``deforms`` : whether it was estimated from an object whose deformation was estimated, too.
+    """
     wrong: list[CameraTerm] = [term for term, found in estimate.terms.items() if found.is_wrong and found.is_observable]
     named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in wrong if term != "readout"]
     if named:
@@ -22,6 +25,7 @@ def camera_notes(estimate: CameraEstimate) -> Iterator[str]:
         yield (
             f"the camera has a rolling shutter: readout_s {_described('readout', estimate.terms['readout'])}. Write it "
             "into the camera file, or estimate it with morph slam --refine-camera readout"
+            + (". It may be longer, because the estimated deformation takes up a part of what it does" * deforms)
         )
     hidden: list[CameraTerm] = [
         term for term, found in estimate.terms.items() if not found.is_observable and term != "readout"

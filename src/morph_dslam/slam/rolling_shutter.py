@@ -91,8 +91,8 @@ def seen_at_middle_row(
     return Followed(seen.ids, pixels, seen.right + pixels[:, 0] - seen.pixels[:, 0])
 
 
-class RowPoses:
-    """Poses of a camera at the instants of single rows, frame by frame: its velocity is that since the frame before.
+class MiddleRowPoses:
+    """Poses of a camera at the middle rows' instants, frame by frame; its velocity is that since the frame before.
 
     Parameters
     ----------
@@ -102,28 +102,15 @@ class RowPoses:
 
     def __init__(self, rigid_map: RigidMap, camera: Camera) -> None:
         self._map, self._camera = rigid_map, camera
-        self._time, self._pose, self._twist = -np.inf, np.eye(4), np.zeros(6)
+        self._time, self._pose = -np.inf, np.eye(4)
 
-    def add(self, timestamp: float, pose: Array, seen: Followed) -> None:
-        """Take in the next frame, its pose (4, 4) as of a global shutter, and where it saw map points."""
+    def add(self, timestamp: float, pose: Array, seen: Followed) -> Array:
+        """The pose (4, 4) of the next frame, by that as of a global shutter (4, 4) and where it saw map points."""
         gap, before = timestamp - self._time, inverse(self._pose)
-        self._twist = np.zeros(6)
         for _ in range(ROUNDS if LEAST_GAP_S <= gap < MOST_GAP_S and len(seen.ids) >= LEAST_INLIERS else 0):
-            self._twist = twist_of(pose @ before, gap)
-            pose = refined(self._map, self._camera, pose, self._twist, seen)
+            pose = refined(self._map, self._camera, pose, twist_of(pose @ before, gap), seen)
         self._time, self._pose = timestamp, pose
-
-    def where_seen(self, point: Array) -> Array:
-        """The newest pose (4, 4), at the instant of the row that shows a point (3,) of the map."""
-        result, local = self._pose.copy(), self._pose[:3, :3] @ point + self._pose[:3, 3]
-        row = self._camera.project_recorded(local[None])[0, 1]
-        if np.isfinite(row):
-            row = float(np.clip(row, 0, self._camera.height - 1))
-            seconds = self._camera.readout_s * row_times(np.array([row]), self._camera)[0]
-            turn = Rotation.from_rotvec(self._twist[:3] * seconds).as_matrix()
-            result[:3] = turn @ result[:3]
-            result[:3, 3] += self._twist[3:] * seconds
-        return result
+        return pose
 
 
 def correct_path(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory, seen: list[Followed]) -> Trajectory:

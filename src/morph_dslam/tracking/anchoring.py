@@ -24,7 +24,7 @@ from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
 from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
-from morph_dslam.slam.rolling_shutter import RowPoses
+from morph_dslam.slam.rolling_shutter import MiddleRowPoses
 from morph_dslam.slam.slam import Slam
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
 from morph_dslam.tracking.estimator import Estimator, Prior, State, moved
@@ -99,7 +99,7 @@ class Anchor:
         still.remove(good[taken])
         self.slam = Slam(camera)
         self.slam.use_map(still)
-        self._rows = RowPoses(still, camera) if camera.readout_s else None
+        self._rows = MiddleRowPoses(still, camera) if camera.readout_s else None
 
     @classmethod
     def of(cls, registrations: Mapping[str, Registration], camera: Camera) -> Anchor:
@@ -121,14 +121,10 @@ class Anchor:
         frame = self.slam.process_frame(image, index, timestamp)
         if frame.pose is None:
             return {}, frame
-        poses = dict.fromkeys(self._places, frame.pose)
+        pose = frame.pose
         if self._rows is not None:
-            self._rows.add(timestamp, frame.pose.camera_from_world, frame.points)
-            for name, place in self._places.items():
-                # All of an object counts as seen with the row of its middle.
-                seen_at = self._rows.where_seen(place.world_from_object.apply(place.centre))
-                poses[name] = replace(frame.pose, camera_from_world=seen_at)
-        return {name: place.pose_prior(poses[name]) for name, place in self._places.items()}, frame
+            pose = replace(pose, camera_from_world=self._rows.add(timestamp, pose.camera_from_world, frame.points))
+        return {name: place.pose_prior(pose) for name, place in self._places.items()}, frame
 
     def image_for(self, camera: Camera) -> Image | None:
         """The frame that was located last as a tracker with this camera takes it; None if it is of another one."""

@@ -3,7 +3,8 @@
 The points that were followed are taken as those of a rigid object: what the estimated deformation moves them by in the
 image is taken out. Their places, the poses and the camera are then adjusted together, as for a map of a scene. What a
 model of a deformation is off by looks like a wrong principal point or lens: an object that deforms checks the focal
-length and the readout time only.
+length and the readout time only. The latter shows even where the model fails, which may be because of it: what it does
+grows with the row and with the velocity, and changes its sign with both.
 """
 
 from __future__ import annotations
@@ -54,18 +55,26 @@ class CameraCheck:
         deformed, rest = (
             self._camera.project(local) for local in (points.in_camera(seen.state), pose.apply(points.rest))
         )
-        pixels = seen.pixels - deformed + rest
+        # What the readout time does is to be seen, not what is left of it.
+        pixels = (seen.pixels if seen.recorded is None else seen.recorded) - deformed + rest
         ids = np.flatnonzero((seen.weights > 0.0) & np.isfinite(pixels).all(axis=1))
         self._rest = points.rest
         self._times.append(timestamp)
         self._world_from_camera.append(pose.inverse.matrix)
         self._seen.append(Followed(ids, pixels[ids]))
 
-    def estimate(self) -> CameraEstimate | None:
-        """The camera by all frames; None where no frame was taken in."""
+    def estimate(self, model_fails: bool = False) -> CameraEstimate | None:
+        """The camera by all frames; None where they tell nothing.
+
+        ``model_fails`` : whether the model leaves residuals in some of them.
+        """
         if not self._seen:
             return None
         points = RigidMap()
         points.add_points(self._rest, np.zeros((len(self._rest), 2)), 0, GOOD)
         path = Trajectory(np.array(self._times), np.array(self._world_from_camera))
-        return estimate_camera(points, self._camera, path, self._seen, self._terms)
+        found = estimate_camera(points, self._camera, path, self._seen, self._terms)
+        if not model_fails:
+            return found
+        readout = found.terms["readout"]
+        return CameraEstimate(self._camera, {"readout": readout}) if readout.is_wrong else None

@@ -358,21 +358,21 @@ MOST_STATES = 60
 
 def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults, view: AugmentedView) -> None:
     """Draw every frame of the run; hidden and lost frames are shown as they are, with the reason."""
-    states = run.states()
-    known = [state for state in states if state is not None]
+    known = [state for state in run.states() if state is not None]
     limits = view.range_of(known[:: max(1, len(known) // MOST_STATES)])
     maps = camera.undistortion_maps()
 
-    def drawn(state: State | None, result: FrameResult, frame: Frame) -> NDArray[np.uint8]:
+    def drawn(result: FrameResult, frame: Frame) -> NDArray[np.uint8]:
         image = frame.image
         if maps is not None:
             image = np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+        state = result.shown_state
         if state is None:
             return with_caption(image, f"frame {frame.index}: {result.status}: {result.reason}")
         return view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps)
 
     # Frames that may be missing after those of the run are read ahead, but never asked for.
-    rows = zip(states, run.results, ahead(iter(source)), strict=False)
+    rows = zip(run.results, ahead(iter(source)), strict=False)
     with VideoWriter(path, source.fps, (camera.width, camera.height)) as video, threads_side_by_side():
         for image in tqdm(ahead(starmap(drawn, rows)), total=len(run), desc="drawing", unit="frame"):
             video.write(image)

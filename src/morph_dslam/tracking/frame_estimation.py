@@ -33,6 +33,7 @@ from morph_dslam.tracking.outcomes import DepthNotUsed
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.row_motion import RowMotion
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 from morph_dslam.tracking.state import BoundPoints, moved, pose_increment
 from morph_dslam.tracking.systematic_errors import Unexplained
@@ -159,19 +160,27 @@ class FrameEstimation:
         """
         measurement = self._reference.measure(picture, state, offsets)
         with stage("estimate"):
-            return self._trimmed(measurement, state, prior)
+            return self._trimmed(measurement, state, prior, picture.motion)
 
-    def _trimmed(self, measurement: Measurement, start: State, prior: Prior | None) -> PoseHypothesis:
-        """Estimate from all valid measurements, then from those that agree with the first estimate."""
+    def _trimmed(
+        self, measurement: Measurement, start: State, prior: Prior | None, motion: RowMotion | None = None
+    ) -> PoseHypothesis:
+        """Estimate from all valid measurements, then from those that agree with the first estimate.
+
+        ``motion`` : by which pixels are moved to the middle row's instant; None to leave them.
+        """
         estimate, used = None, measurement.valid
         for _ in range(2):
+            if motion is not None:
+                shift = motion.shift(self._reference.projected, start, measurement.recorded)
+                measurement = replace(measurement, pixels=measurement.recorded - shift)
             estimate = self._estimate(measurement, used, start, prior)
             self._estimator.known.squared_px = max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
             limit = np.clip(self._options.inlier_sigmas * estimate.sigma_px, *self._options.inlier_px)
             with np.errstate(invalid="ignore"):
                 close = np.linalg.norm(estimate.residuals, axis=1) < limit
             agreeing = measurement.valid & close
-            if (agreeing == used).all():
+            if motion is None and (agreeing == used).all():
                 break
             start, used = estimate.state, agreeing
         assert estimate is not None
@@ -192,7 +201,8 @@ class FrameEstimation:
             )[1]
             self._balance.learn_outline(seen, attempt.estimate.residuals, self._taken(seen, state, whole))
             if picture.has_grey and self._reference.outline is not None:
-                self._reference.outline.take_brightness(picture.grey, attempt.estimate.state)
+                shown = state if picture.motion is None else picture.motion.as_seen(state)
+                self._reference.outline.take_brightness(picture.grey, shown)
             return
         residuals = attempt.estimate.residuals[: len(attempt.inliers)]
         self._noise.learn(attempt.measurement.spread, residuals, attempt.inliers)
@@ -294,7 +304,7 @@ class FrameEstimation:
         if picture.has_grey and not outline.knows_brightness:
             outline.take_brightness(picture.grey, estimate.state)
         drawing, occluders = attempt.measurement.drawing, picture.occluder_depth
-        seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing)
+        seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing, picture.motion)
         seen = self._uncovered(seen, attempt, estimate.state)
         if balance.weight == 0.0:
             balance.learn_texture(*self._supporting(attempt, estimate))
@@ -303,7 +313,7 @@ class FrameEstimation:
         # After the first search the state only says where to look the second time: it need not be exact.
         wide = self._with_outline(attempt, seen.weighted(balance.weight))
         state = self._scout.fitted(wide, estimate.state, attempt.prior).state
-        seen = outline.measure_again(picture.grey, state, REACH_PX // 2, occluders)
+        seen = outline.measure_again(picture.grey, state, REACH_PX // 2, occluders, picture.motion)
         seen = self._uncovered(seen, attempt, state).weighted(balance.weight)
         together = self._with_outline(attempt, seen)
         found = self._estimator.fitted(together, state, attempt.prior)
@@ -347,14 +357,14 @@ class FrameEstimation:
         if picture.has_grey and not outline.knows_brightness:
             outline.take_brightness(picture.grey, state)
         empty = np.zeros((0, 2))
-        nothing = Measurement(empty, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool), np.zeros(0))
+        nothing = Measurement(empty, empty, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool), np.zeros(0))
         larger = np.clip(np.sqrt(outline.extent(start) / USUAL_EXTENT_PX), 1.0, MOST_LARGER)
         reaches = [int(larger * r) for r in REACHES if r <= reach]
         attempt = None
         for number, far in enumerate(reaches):
             last = number == len(reaches) - 1
             estimator = self._estimator if last else self._scout
-            seen = outline.measure(picture.grey, state, far, picture.occluder_depth)
+            seen = outline.measure(picture.grey, state, far, picture.occluder_depth, motion=picture.motion)
             for _ in range(2):  # the second time without what does not agree
                 together = Observations(seen.points, seen.pixels, seen.weights, seen.normals, np.zeros((0, 0)))
                 estimate = estimator.fit(together, state, prior)
@@ -389,7 +399,7 @@ class FrameEstimation:
             return replace(attempt, depth_unused=DepthNotUsed())
         # Points whose windows overlap err alike in the image, and each counts for less than its depth does.
         squared_px = self._reference.redundancy * max(attempt.estimate.sigma_px, LEAST_SIGMA_PX) ** 2
-        pixels, camera, sigma = attempt.measurement.pixels, self._estimator.camera, self._options.depth_sigma
+        pixels, camera, sigma = attempt.measurement.recorded, self._estimator.camera, self._options.depth_sigma
         depths = PointDepths.sampled(picture.depth, pixels, attempt.inliers, camera, squared_px, sigma)
         ratio = depths.ratio_to(self._reference.points.in_camera(attempt.estimate.state)[:, 2])
         if ratio is None or not 1.0 / MOST_TIMES < ratio < MOST_TIMES:

@@ -17,6 +17,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import DepthNotUsed, Rejection, RejectionReason
 from morph_dslam.tracking.outline import OutlineMeasurement
 from morph_dslam.tracking.outline_weight import MEDIAN_OF_NUMBER
+from morph_dslam.tracking.row_motion import RowMotion
 
 #: Where less than this share of all points agree, they must agree closely.
 MOST_AGREE = 0.5
@@ -38,12 +39,14 @@ class Image:
     normalized : (h, w), the same with contrast normalized.
     depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
     occluder_depth : (h, w) of other objects, metres, infinite where there are none; None if none is known.
+    motion : of the object while a rolling shutter recorded the frame; None where it is not known, or of a global one.
     """
 
     grey: NDArray[np.uint8]
     normalized: NDArray[np.uint8]
     depth: NDArray[np.float32] | None = None
     occluder_depth: NDArray[np.float32] | None = None
+    motion: RowMotion | None = None
 
     @cached_property
     def half(self) -> NDArray[np.uint8]:

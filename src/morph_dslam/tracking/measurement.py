@@ -179,7 +179,8 @@ class Measurement:
 
     Attributes
     ----------
-    pixels : (p, 2) where they were found
+    pixels : (p, 2) where they were found, at the middle row's instant.
+    recorded : (p, 2) where the image shows that; with a global shutter the same.
     valid : (p,) which to believe.
     visible : (p,) which no other part of the object hides.
     spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
@@ -187,6 +188,7 @@ class Measurement:
     """
 
     pixels: Array
+    recorded: Array
     valid: NDArray[np.bool_]
     visible: NDArray[np.bool_]
     spread: Array
@@ -225,6 +227,7 @@ def compare_with_rendering(
     predicted: Array,
     visible: NDArray[np.bool_],
     offsets: Array | None = None,
+    drift: Array | None = None,
 ) -> Measurement:
     """Follow points from the rendered reference view to the frame.
 
@@ -236,15 +239,17 @@ def compare_with_rendering(
     predicted : (p, 2) where the rendering shows the points.
     visible : (p,) which of them can be seen.
     offsets : (p, 2) how far from there they are about to be in the frame; None where that is not known.
+    drift : (p, 2) how far from there a rolling shutter shows them; None of a global one.
     """
-    pixels, valid = predicted.copy(), np.zeros(len(predicted), dtype=bool)
+    shown = predicted if drift is None else predicted + drift
+    pixels, valid = shown.copy(), np.zeros(len(predicted), dtype=bool)
     spread = np.full(len(predicted), np.inf)
 
     def look_for(rows: NDArray[np.int64], guesses: Array, levels: int) -> None:
         places = predicted[rows]
         found, ok = follow(rendering.image, frame, places, guesses, levels)
         found, correlation, exactness = compare_patches(rendering.image, frame, places, found, PATCH_HALF)
-        near = np.linalg.norm(found - places, axis=1) < LARGEST_CORRECTION_PX
+        near = np.linalg.norm(found - shown[rows], axis=1) < LARGEST_CORRECTION_PX
         ok &= near & np.isfinite(exactness) & (correlation > LEAST_CORRELATION)
         pixels[rows], valid[rows], spread[rows] = found, ok, exactness
 
@@ -252,8 +257,8 @@ def compare_with_rendering(
         rows = np.flatnonzero(visible)
         look_for(rows, predicted[rows] + offsets[rows], 0)
     rows = np.flatnonzero(visible & ~valid)
-    look_for(rows, predicted[rows], CORRECTION_LEVELS)
-    return Measurement(pixels, valid, visible, spread)
+    look_for(rows, shown[rows], CORRECTION_LEVELS)
+    return Measurement(pixels, pixels, valid, visible, spread)
 
 
 #: Another picture takes a triangle over from the first where it shows that much more area: seams are few, and

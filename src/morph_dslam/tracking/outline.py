@@ -23,6 +23,7 @@ from morph_dslam.tracking.binding import Drawing, DrawnSurface, View, view_of
 from morph_dslam.tracking.contours import Contour, SurfaceEdges, find_contour
 from morph_dslam.tracking.edge_profiles import LIKELY_LEVELS, SIDE_PX, search_outline
 from morph_dslam.tracking.estimator import BoundPoints, State
+from morph_dslam.tracking.row_motion import RowMotion
 
 Array = NDArray[np.float64]
 #: Points on the contour, at most.
@@ -165,6 +166,7 @@ class Outline:
         reach: int,
         occluder_depth: NDArray[np.float32] | None = None,
         drawing: Drawing | None = None,
+        motion: RowMotion | None = None,
     ) -> OutlineMeasurement:
         """Search for the outline around where ``state`` shows it.
 
@@ -174,25 +176,39 @@ class Outline:
         reach : how far to search to either side, pixels.
         occluder_depth : (h, w) of other objects, metres, infinite where there are none.
         drawing : of the object in a state that may be near enough; None to draw it here.
+        motion : while a rolling shutter recorded the image.
         """
         if drawing is None:
             self._take_contour(self._drawn(state), occluder_depth)
-            return self._searched(grey, self._contour.pixels, reach)
+            return self._searched(grey, self._contour.pixels, reach, self._drift(motion, state))
         self._take_contour(drawing, occluder_depth)
-        return self.measure_again(grey, state, reach, occluder_depth)
+        return self.measure_again(grey, state, reach, occluder_depth, motion)
 
     def measure_again(
-        self, grey: NDArray[np.uint8], state: State, reach: int, occluder_depth: NDArray[np.float32] | None = None
+        self,
+        grey: NDArray[np.uint8],
+        state: State,
+        reach: int,
+        occluder_depth: NDArray[np.float32] | None = None,
+        motion: RowMotion | None = None,
     ) -> OutlineMeasurement:
         """`measure` along the same points of the surface as the last time, unless they have moved far since then.
 
         By first order the contour of a smooth surface moves as the points on it do.
         """
-        places = self._camera.project(self.points.in_camera(state)[self._slots])
+        places = self._places(state)
         moved = np.linalg.norm(places - self._contour.pixels, axis=1)
         if not len(moved) or not moved.max() < SAME_CONTOUR_PX:
-            return self.measure(grey, state, reach, occluder_depth)
-        return self._searched(grey, places, reach)
+            return self.measure(grey, state, reach, occluder_depth, motion=motion)
+        return self._searched(grey, places, reach, self._drift(motion, state))
+
+    def _places(self, state: State) -> Array:
+        """Where the contour's points (k, 2) are in the image in a state."""
+        return self._camera.project(self.points.in_camera(state)[self._slots])
+
+    def _drift(self, motion: RowMotion | None, state: State) -> Array:
+        """How far (k, 2) from there a rolling shutter shows them."""
+        return np.zeros(2) if motion is None else motion.drift(self._places, state)
 
     def _take_contour(self, drawing: Drawing, occluder_depth: NDArray[np.float32] | None) -> None:
         """Find the contour in a drawing, and how bright the object is beside it."""
@@ -208,13 +224,14 @@ class Outline:
         self._used = np.zeros(N_POINTS, dtype=bool)
         self._used[self._slots] = True
 
-    def _searched(self, grey: NDArray[np.uint8], places: Array, reach: int) -> OutlineMeasurement:
-        """Search along the contour's normals from ``places`` (k, 2), where its points are in the image by now.
+    def _searched(self, grey: NDArray[np.uint8], places: Array, reach: int, drift: Array) -> OutlineMeasurement:
+        """Search along the contour's normals from ``places`` (k, 2), where its points are by now, and ``drift`` (k, 2).
 
         Points stay in the places of those that were near them last: what one errs by is then known as the same.
         """
         slots, normals_there = self._slots, self._contour.normals
-        offsets = np.asarray(search_outline(grey, places, normals_there, self._contour.turns_away, self._beside, reach))
+        shown, turns_away = places + drift, self._contour.turns_away
+        offsets = np.asarray(search_outline(grey, shown, normals_there, turns_away, self._beside, reach))
         found = np.zeros(N_POINTS)
         found[slots] = np.isfinite(offsets)
         pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))

@@ -349,7 +349,8 @@ class ReferenceView:
             )  # fmt: skip
             if picture.occluder_depth is not None:
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
-            found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets)
+            drift = None if picture.motion is None else picture.motion.drift(self.projected, state)
+            found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets, drift)
         return replace(found, drawing=Drawing(state, view, rendering.triangle_ids, rendering.depth))
 
     def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:

@@ -40,6 +40,7 @@ class Keyframe:
     state : estimated there.
     sigma_px : robust standard deviation of the residuals in it.
     outline : where the outline was seen, if it was looked for: it ties the texture to the object's edges.
+    recorded : (p, 2) where a rolling shutter shows what is at ``pixels`` at the middle row's instant; None if the same.
     """
 
     pixels: Array
@@ -47,6 +48,7 @@ class Keyframe:
     state: State
     sigma_px: float
     outline: OutlineMeasurement | None = None
+    recorded: Array | None = None
 
     def measured(self, points: BoundPoints, met: NDArray[np.bool_]) -> tuple[BoundPoints, Array, Array, Array]:
         """All that was measured, of ``points`` (those of the reference view that ``met``) and of the outline.

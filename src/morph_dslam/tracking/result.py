@@ -18,6 +18,8 @@ from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import displacement_std, von_mises_std
 from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Status, TrackingWarning, reason_text
 from morph_dslam.tracking.reactions import Reaction, Reactions
+from morph_dslam.tracking.row_motion import RowMotion
+from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound=TrackingWarning)
@@ -63,6 +65,7 @@ class FrameResult:
     made_view : whether the frame became a reference view itself.
     discrepancy : what the object's shape has beyond the model's; None where it was not estimated.
     jumps : where the surface was found to open or slip along a line, in this frame or before; as at a crack.
+    motion : while a rolling shutter recorded the frame; None where it is not known, or of a global one.
     modulus_std : standard deviation of a factor common to all moduli, a share, as the tracker's options have it.
     timings_ms : by stage, milliseconds.
     total_ms : of the whole frame, milliseconds.
@@ -86,6 +89,7 @@ class FrameResult:
     made_view: bool = False
     discrepancy: Discrepancy | None = None
     jumps: tuple[DisplacementJump, ...] = ()
+    motion: RowMotion | None = None
     modulus_std: float = 0.0
     timings_ms: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
     total_ms: float = 0.0
@@ -101,6 +105,17 @@ class FrameResult:
         ]
         points = f"{self.n_inliers} of {self.n_points} points agree"
         return f"FrameResult({', '.join([self.status, self.model.name, *found, points])})"
+
+    @property
+    def shown_state(self) -> State | None:
+        """The state to draw over the image, None unless tracked.
+
+        Its pose is that at the instant of the rows that show the object, which a rolling shutter records earlier or
+        later than the middle row.
+        """
+        if self.estimate is None:
+            return None
+        return self.estimate.state if self.motion is None else self.motion.as_seen(self.estimate.state)
 
     @property
     def tracked(self) -> bool:

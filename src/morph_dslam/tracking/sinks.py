@@ -130,9 +130,9 @@ class LivePicture:
         if len(missing) == len(results):
             return with_caption(image, caption)
         found = [
-            (self._views[name], result.estimate.state, result)
+            (self._views[name], result.shown_state, result)
             for name, result in results.items()
-            if result.estimate is not None
+            if result.shown_state is not None
         ]
         for view, state, result in sorted(found, key=lambda one: -one[0].distance(one[1])):
             image = view.draw(image, state, self._limits, caption, result.discrepancy, result.jumps)

@@ -335,12 +335,12 @@ class _Job:
         notices = [*part.registration.warnings, *self._again[part.name].notices]
         of_camera = camera_doubts(part.camera) if part.object.scene is None else part.object.scene.camera_notes
         notices += [Remark(note) for note in of_camera]
-        checked = self._checks[part.name].estimate() if part.name in self._checks else None
-        if part.model.parameters and _leaves_residuals(folder.results):
-            checked = None  # what the model leaves may be its own error as well as the camera's
+        deforms, checked = bool(part.model.parameters), None
+        if part.name in self._checks:
+            checked = self._checks[part.name].estimate(deforms and _leaves_residuals(folder.results))
         if checked is not None:
             facts["camera"] = {term: found.facts() for term, found in checked.terms.items()}
-            notices += [Remark(note) for note in camera_notes(checked)]
+            notices += [Remark(note) for note in camera_notes(checked, deforms)]
         if part.options.use_discrepancy and part.model.stresses:
             notices.append(Remark(f"{NOT_IN_EQUILIBRIUM}; those in plots and tables are the model's without it"))
         if isinstance(self._source, SynchronizedFrames):

@@ -51,6 +51,7 @@ from morph_dslam.tracking.patches import LEVELS, follow, normalize_contrast, zer
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, fewest_points
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.row_motion import StateHistory
 from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import error_factors_of
 from morph_dslam.tracking.tracker_inputs import Picture, check_camera, check_look, check_pose, check_tracker
@@ -160,6 +161,7 @@ class Tracker:
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
         self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
+        self._history = StateHistory(camera, self.model.nodes.mean(axis=0))
         self.last_seen: Keyframe | None = None
         self._views: ViewSet | None = None
         self._last = self._velocity_base = self._start = registration.state
@@ -258,7 +260,9 @@ class Tracker:
         """Undistort and normalize contrast; the first frame is the reference if none was given, a gap is a loss."""
         with stage("prepare"):
             picture = Picture.of(frame, self.camera, self.options.use_depth)
-            image = replace(ready or self._prepared(picture), depth=picture.depth, occluder_depth=occluder_depth)
+            motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
+            image = ready or self._prepared(picture)
+            image = replace(image, depth=picture.depth, occluder_depth=occluder_depth, motion=motion)
             if self._views is None:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
@@ -284,7 +288,8 @@ class Tracker:
             # Half of the size is exact enough for a start.
             found, ok = follow(self._image.half, image.half, 0.5 * self._pixels[rows], 0.5 * guesses[rows], LEVELS - 1)
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
-            pixels[rows], valid[rows] = 2.0 * found, ok
+            found = 2.0 * found if image.motion is None else image.motion.since_last(last[rows], 2.0 * found)
+            pixels[rows], valid[rows] = found, ok
             return Followed(pixels, valid, zero_where_unknown(self._pixels - last))
 
     def _match(self, image: Image, followed: Followed | None, prior: Prior | None) -> PoseHypothesis:
@@ -378,6 +383,7 @@ class Tracker:
             placed = self._placed_by_map(camera)
             if placed is not None:
                 self._last = replace(self._last, camera_from_object=placed.pose)
+            self._history.add(None if placed is None else self._last)
         self._image, self._lost = image, rejection is not None
         self._n_lost = self._n_lost + 1 if self._lost else 0
 
@@ -395,7 +401,8 @@ class Tracker:
             result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings)
             is_still = self.options.pose == "still"
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
-        return replace(result, view=self._view.number, modulus_std=self.options.modulus_std)
+        number, modulus_std = self._view.number, self.options.modulus_std
+        return replace(result, view=number, motion=self._image.motion, modulus_std=modulus_std)
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
         """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
@@ -438,6 +445,7 @@ class Tracker:
     def continue_from(self, state: State) -> None:
         """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
         self._last = self._start = state
+        self._history.replace_last(state)
         if self._views is not None:
             self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
@@ -491,11 +499,12 @@ class Tracker:
 
     def _learn(self, image: Image, hypothesis: PoseHypothesis) -> None:
         """Take in an accepted frame."""
-        estimate, inliers, pixels = hypothesis.estimate, hypothesis.inliers, hypothesis.measurement.pixels
+        estimate, inliers, found = hypothesis.estimate, hypothesis.inliers, hypothesis.measurement
         self.last_seen = None
         if not self._view.number:
             weights = inliers.astype(float)
-            self.last_seen = Keyframe(pixels, weights, estimate.state, estimate.sigma_px, hypothesis.outline)
+            known = (estimate.state, estimate.sigma_px, hypothesis.outline)
+            self.last_seen = Keyframe(found.pixels, weights, *known, found.recorded)
             if not hypothesis.outline_alone:
                 shape = self.reference.points.field.value(estimate.state.parameters)
                 depth = middle(self.reference.points.in_camera(estimate.state)[:, 2])
@@ -504,12 +513,13 @@ class Tracker:
             self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
+        self._history.add(self._last)
         angles = self._registration.per_sequence
         self._start = a_turn_back(self.model, with_unobservable_at_default(self.model, estimate), estimate, angles)
         if self.options.start == "constant-velocity":
             self._start = at_constant_velocity(self._velocity_base, self._start)
         self._supported = inliers
-        self._pixels = np.where(inliers[:, None], pixels, self.reference.projected(self._last))
+        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis, image)
         if not self._lost:

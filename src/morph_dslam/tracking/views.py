@@ -24,6 +24,7 @@ from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import PATCH_HALF, PATCH_WINDOW, Rendering
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.recovery import Recovery
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples, choose_view, covered_share
 from morph_dslam.tracking.sequence_filter import PointChange
@@ -404,7 +405,7 @@ class ViewSet:
         if reject(found, self._options) is not None:
             return None
         places = view.reference.projected(found.estimate.state)
-        return Change(view, found.inliers, np.where(found.inliers[:, None], found.measurement.pixels, places))
+        return Change(view, found.inliers, np.where(found.inliers[:, None], found.measurement.recorded, places))
 
     def _begin(
         self, picture: Image, attempt: PoseHypothesis, stated: Estimate, unexplained_px: float, now: Array
@@ -417,6 +418,7 @@ class ViewSet:
         estimator, options, surface = self._estimator, self._options, old.surface
         if not is_known_well(attempt, spread / self._size, unexplained_px, options):
             return None
+        picture = self._of_one_instant(picture, stated.state)
         should_be = old.rendered(stated.state)
         if not is_sharp(picture, attempt, should_be, PATCH_HALF):
             return None
@@ -429,6 +431,13 @@ class ViewSet:
             self._pause = PAUSE
             return None
         return _BegunView(made, spread, now)
+
+    def _of_one_instant(self, picture: Image, state: State) -> Image:
+        """The picture as of the middle row's instant, around the object in ``state``."""
+        if picture.motion is None:
+            return picture
+        grey = picture.motion.rectified(picture.grey, state, self.active.reference.points.in_camera(state))
+        return replace(picture, grey=grey, normalized=normalize_contrast(grey))
 
     def _gone_on(self, state: State) -> Change | None:
         """A change to the view that was begun, the object being in ``state`` by now.
