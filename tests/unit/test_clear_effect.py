@@ -7,9 +7,12 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import Parameter, SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.sequence_filter import SequenceFilter, without_clear_effect
+from morph_dslam.tracking.still import held as still_pose
 from tests.support.bent_tube import AXIS, bent_tube
 from tests.support.measured_points import bound_points, measured
 
@@ -65,8 +68,8 @@ def test_an_effect_is_clear_from_four_standard_deviations_on(lengths, absent):
     def linear_at(there):
         return ESTIMATOR.linear(seen, replace(alone, state=there))
 
-    spread = np.array([load / lengths, 0.1])
-    found = without_clear_effect(MODEL, linear_at(state), linear_at, state, spread, np.array([TURN]))
+    others, turn = np.array([[load / lengths, 0.0]]), np.array([[0.0, 1.0]])
+    found = without_clear_effect(MODEL, linear_at(state), linear_at, state, others, turn, np.array([0.1]))
     assert found.tolist() == [absent]
 
 
@@ -78,3 +81,64 @@ def test_what_is_held_leaves_the_others_as_if_it_were_known():
     held = linear.holding(np.array([TURN]))
     np.testing.assert_allclose(held.inverse[np.ix_(others, others)], expected, rtol=1e-6)
     assert not held.weighted_jacobian[:, :, TURN].any()
+
+
+def share_of(a, b):
+    return a / (a + b)
+
+
+def pulled_model():
+    """u = pull (z² e_x + share z² e_y) of two moduli, whose share is fitted by polynomials of second order."""
+    lower, upper = np.array([0.0, 1.0, 1.0]), np.array([1.0, 3.0, 3.0])
+    degrees = np.array([(p, i, j) for p in (0, 1) for i in range(3) for j in range(3)])
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (4000, 3))
+    pull, a, b = (lower + 0.5 * (x + 1.0) * (upper - lower)).T
+    terms = np.prod(np.cos(degrees[None] * np.arccos(x)[:, None]), axis=2)
+    coefficients = np.linalg.lstsq(terms, np.column_stack([pull, pull * share_of(a, b)]), rcond=None)[0]
+    functions, tube = ParameterFunctions(lower, upper, degrees, coefficients), bent_tube()
+    zero, squared = np.zeros(len(tube.nodes)), tube.nodes[:, 2] ** 2
+    modes = np.stack([np.column_stack([squared, zero, zero]), np.column_stack([zero, squared, zero])])
+    values = np.array([functions.rows(np.array(mu))[2:, 1] for mu in zip(pull[:300], a[:300], b[:300], strict=True)])
+    total = (a + b)[:300] ** 2
+    true = np.column_stack([(pull * b)[:300] / total, -(pull * a)[:300] / total])
+    relative = np.linalg.norm(values - true, axis=0) / np.linalg.norm(true, axis=0)
+    return replace(
+        tube,
+        parameters=(
+            Parameter("pull", "ratio", "1", 0.0, 1.0, 0.0),
+            Parameter("a", "ratio", "1", 1.0, 3.0, 2.0),
+            Parameter("b", "ratio", "1", 1.0, 3.0, 2.0),
+        ),
+        displacement=SeparatedField(modes, functions),
+        stresses={},
+        certificate={"sensitivity": {name: {"relative_l2": float(e)} for name, e in zip("ab", relative, strict=True)}},
+    )
+
+
+def test_a_common_factor_shows_only_by_the_errors_of_the_sensitivities():
+    """Of two moduli displacements tell the share alone."""
+    model, mu = pulled_model(), np.array([1.0, 2.4, 1.6])
+    estimator, state = Estimator(model, CAMERA), State(mu, POSE)
+    seen = seen_of(bound_points(model, COUNT), state)
+    alone = estimator.fit(seen, state)
+
+    def linear_at(there):
+        return estimator.linear(seen, replace(alone, state=there))
+
+    directions = np.array([[0.0, 1.6, -2.4], [0.0, 2.4, 1.6]]) / np.hypot(2.4, 1.6)
+    args = linear_at(state), linear_at, state, np.zeros((0, 3)), directions, np.full(2, 1e-6)
+    assert without_clear_effect(model, *args).tolist() == [False, True]
+    assert without_clear_effect(replace(model, certificate={}), *args).tolist() == [False, False]
+
+
+def test_a_pose_that_is_held_does_not_make_known_what_nothing_shows():
+    """Without pull neither modulus moves anything."""
+    model = pulled_model()
+    estimator, start = Estimator(model, CAMERA), State(model.default, POSE)
+    seen = seen_of(bound_points(model, COUNT), start, SIGMA * np.random.default_rng(0).standard_normal((COUNT, 2)))
+    free, held = (
+        SequenceFilter(estimator, [1, 2]).fuse(seen, estimator.fit(seen, start, known), known).parameter_std
+        for known in (None, still_pose(start, estimator))
+    )
+    assert (held[1:] > 0.9 * free[1:]).all()
+    assert held[0] < free[0]

@@ -79,6 +79,15 @@ class LinearCost:
         hessian[indices, indices] = max(largest, 1e-30) / self.scale[indices] ** 2
         return LinearCost(rows, of_depths, hessian, self.scale, self.correlation)
 
+    def with_known(self, hessian: Array) -> LinearCost:
+        """The same cost with what is known of the unknowns beforehand in its Hessian (n, n).
+
+        What is known far better than measured, as a pose that is held, does not make the rest seem to be seen.
+        """
+        measured, whole = np.diag(self.hessian), np.diag(hessian)
+        shares = np.where((measured > 0.0) & (whole > measured), measured / np.where(whole > 0.0, whole, 1.0), 1.0)
+        return replace(self, hessian=hessian, scale=self.scale * np.sqrt(shares))
+
     @staticmethod
     def joined(costs: Sequence[LinearCost], correlation: Correlation) -> LinearCost:
         """The sum of costs of the same unknowns, their points, with errors of this correlation, one after the other."""

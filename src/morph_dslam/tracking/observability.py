@@ -17,7 +17,7 @@ from morph_dslam.geometry import cross_matrix
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.separated import SeparatedField
-from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.estimator import BOUND_SHARE, Estimate
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
@@ -125,13 +125,15 @@ def _change(parameter: Parameter, share: float) -> str:
 def one_value(parameter: Parameter, value: float, deviation: float) -> dict[str, object]:
     """The figures of a parameter that is one over the sequence, in its own unit."""
     low, high = value - INTERVAL_95 * deviation, value + INTERVAL_95 * deviation
+    width = parameter.upper - parameter.lower
     return {
         "name": parameter.name,
         "unit": parameter.unit,
         "value": parameter.display(value),
         "standard_deviation": parameter.display(deviation),
         "interval_95": [parameter.display(low), parameter.display(high)],
-        "observable": bool(deviation < UNOBSERVABLE_SHARE * (parameter.upper - parameter.lower)),
+        "observable": bool(deviation < UNOBSERVABLE_SHARE * width),
+        "at_bound": bool(min(value - parameter.lower, parameter.upper - value) < BOUND_SHARE * width),
     }
 
 
@@ -142,7 +144,8 @@ def value_line(figures: dict) -> str:
     text = f"{figures['name']} = {figures['value']:.4g}{unit} over the sequence"
     if not figures["observable"]:
         return f"{text}, but it is unobservable"
-    return f"{text}, 95 % interval {low:.4g} to {high:.4g}{unit}"
+    text += f", 95 % interval {low:.4g} to {high:.4g}{unit}"
+    return f"{text}; its range ends there, the images do not tell it" if figures["at_bound"] else text
 
 
 #: Von Mises stress is sqrt(s' Q s), of three plane or of six components of the stress.

@@ -137,6 +137,8 @@ class _Past:
 #: Of a plane vector that is at least so many standard deviations long, the direction's error is that of the
 #: linear theory but for some per cent: a vector that points the other way is then less likely than 0.001.
 CLEARLY = 4.0
+#: An effect that is not so many times the error of the model's sensitivities may be nothing but that error.
+TRUE_EFFECT = 2.0
 
 
 def without_clear_effect(
@@ -144,31 +146,48 @@ def without_clear_effect(
     linear: LinearCost,
     linear_at: Callable[[State], LinearCost],
     state: State,
+    others: Array,
+    directions: Array,
     spread: Array,
-    indices: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
-    """Which of some parameters (k,) may have no effect on what was measured.
+    """Which of some changes (k,) of the parameters may have no effect on what was measured.
 
     Some parameters act only while others do, as the side from which a lever is turned. While it is not,
     errors of the lever's angle turn it to a side of their own, and the curvature of the cost takes this for a
     measured side. So an effect counts only where it is `CLEARLY` times what the others' errors make it differ.
+    A common factor of two moduli has no effect where displacements are prescribed. A model shows one all the same, by
+    errors of its sensitivities, so that it counts only where it exceeds these.
 
     Parameters
     ----------
     linear : the cost of what was measured, about the ``state`` that was estimated
     linear_at : about another.
-    spread : (d,) standard deviations of the parameters were those at ``indices`` (k,) known, SI.
+    others : (m, d) errors of the other parameters, SI.
+    directions : (k, d) the changes, SI, the best known first.
+    spread : (k,) standard deviations along these, as parts of them.
     """
-    effects = linear.weighted_jacobian[:, :, indices]
-    changes = np.zeros(len(indices))
-    half_ranges = 0.5 * (model.upper - model.lower)
-    for other in np.setdiff1d(np.arange(len(spread)), indices):
-        parameters = state.parameters.copy()
-        step = min(float(spread[other]), float(half_ranges[other]))
-        parameters[other] += step if parameters[other] + step <= model.upper[other] else -step
-        there = linear_at(replace(state, parameters=parameters)).weighted_jacobian[:, :, indices]
-        changes += np.sum((there - effects) ** 2, axis=(0, 1))
-    return np.sum(effects**2, axis=(0, 1)) <= CLEARLY**2 * changes
+    d, k = len(state.parameters), len(directions)
+    effects = linear.weighted_jacobian[:, :, :d] @ directions.T
+    # What is known worse than a direction, or that itself, says nothing against its effect.
+    counts = np.concatenate([np.ones((len(others), k)), np.triu(np.ones((k, k)), 1)])
+    changes = np.zeros(k)
+    for step, counted in zip(np.concatenate([others, spread[:, None] * directions]), counts, strict=True):
+        if not counted.any():
+            continue
+        parameters = state.parameters + step
+        if (parameters < model.lower).any() or (parameters > model.upper).any():
+            parameters = np.clip(state.parameters - step, model.lower, model.upper)
+        there = linear_at(replace(state, parameters=parameters)).weighted_jacobian[:, :, :d] @ directions.T
+        changes += counted * np.sum((there - effects) ** 2, axis=(0, 1))
+    single = np.sum(linear.weighted_jacobian[:, :, :d] ** 2, axis=(0, 1))
+    by_model = directions**2 @ (sensitivity_errors(model) ** 2 * single)
+    return np.sum(effects**2, axis=(0, 1)) <= CLEARLY**2 * changes + TRUE_EFFECT**2 * by_model
+
+
+def sensitivity_errors(model: ReducedModel) -> Array:
+    """Relative errors (d,) of the displacement's sensitivities, as the certificate has them; 0 where it does not."""
+    stated = model.certificate.get("sensitivity", {})
+    return np.array([stated.get(p.name, {}).get("relative_l2") or 0.0 for p in model.parameters])
 
 
 #: The weight of the past in the mean of past and frame stays below this.
@@ -221,7 +240,7 @@ class SequenceFilter(Generic[Frame]):
         self._unknowns = len(estimator.model.parameters) + 6
         self._noise = PixelNoise(MEMORY)
         self._past: _Past | None = None
-        self._unobservable_variance = np.zeros(len(self._constant))
+        self._unobservable = np.zeros((len(self._constant),) * 2)
         self._conflicts = 0
         self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
 
@@ -242,7 +261,7 @@ class SequenceFilter(Generic[Frame]):
         self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
         linear = self._estimator.linear(measured, alone)
         self._noise.add(alone.residuals, measured, _taken(linear, alone.state, known))
-        self._unobservable_variance = self._without_effect(measured, linear, alone, known)
+        self._unobservable = self._without_effect(measured, linear, alone, known)
         errors = self._errors(measured, linear, alone.state, known)
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
@@ -269,23 +288,39 @@ class SequenceFilter(Generic[Frame]):
         return self._without_walk(fused, by_itself) if self._walks else fused
 
     def _without_effect(self, measured: Frame, linear: LinearCost, alone: Estimate, known: Prior | None) -> Array:
-        """Variances (k,) of shared parameters that are unobservable in a frame, zero for the others."""
+        """How far shared parameters (k,) are off that are unobservable in a frame, or combinations of them.
+
+        Returns
+        -------
+        (k, k) by k causes that are the same in all frames, in their standard deviations, SI; zero where all of them are
+        observable.
+        """
         model, d, constant = self._estimator.model, self._unknowns - 6, self._constant
-        nothing = np.zeros(len(constant))
+        self._unobservable = np.zeros((len(constant),) * 2)
         if not 0 < len(constant) < d:
-            return nothing
-        self._unobservable_variance = nothing
+            return self._unobservable
+        ranges = (model.upper - model.lower)[constant]
+        variances, axes = np.ones(1), np.eye(1)
+        if len(constant) > 1:  # directions, the best known first
+            own = self._errors(measured, linear, alone.state, known).covariance[np.ix_(constant, constant)]
+            variances, axes = np.linalg.eigh(own / np.outer(ranges, ranges))
+        directions = np.zeros((len(constant), d))
+        directions[:, constant] = axes.T * ranges
         held = self._errors(measured, linear.holding(constant), alone.state, known).covariance
+        spread = np.sqrt(np.diag(held)[:d])
+        spread[constant] = 0.0
+        others = np.diag(np.minimum(spread, 0.5 * (model.upper - model.lower)))[spread > 0.0]
         absent = without_clear_effect(
             model,
             linear,
             lambda state: self._estimator.linear(measured, replace(alone, state=state)),
             alone.state,
-            np.sqrt(np.diag(held)[:d]),
-            constant,
+            others,
+            directions,
+            np.minimum(np.sqrt(np.maximum(variances, 0.0)), 0.5),
         )
         # Any value in the range is then as likely as any other.
-        return np.where(absent, (model.upper - model.lower)[constant] ** 2 / 12.0, 0.0)
+        return np.asarray((axes * np.where(absent, np.sqrt(1.0 / 12.0), 0.0)) @ axes.T * ranges)
 
     def _with_covariance(
         self,
@@ -383,7 +418,7 @@ class SequenceFilter(Generic[Frame]):
             hessian += information
             by_frames += known.squared_px * information - by_factor.T @ by_factor
         # What a frame does not tell is no better known by many: one more cause that stays the same.
-        by_factor = np.vstack([np.sqrt(self._unobservable_variance)[:, None] * hessian[self._constant], by_factor])
+        by_factor = np.vstack([self._unobservable @ hessian[self._constant], by_factor])
         if past is not None and self._past is not None:
             hessian[:d, :d] += past.information
             weight = self._of_kept(past.information)
@@ -395,7 +430,7 @@ class SequenceFilter(Generic[Frame]):
             by_views = {view: rows @ weight for view, rows in self._past.by_views.items()}
         # Without a past it is the spread of this frame's points alone, which is known already.
         of_points = common * linear.spread if past is None else quadratic(by_point, measured.correlation)
-        linear = linear if known is None and past is None else replace(linear, hessian=hessian)
+        linear = linear if known is None and past is None else linear.with_known(hessian)
         inverse = linear.inverse
         by_point = by_point @ inverse if len(kept) else by_point[:0]
         by_frames, by_factor = inverse @ by_frames @ inverse, by_factor @ inverse
