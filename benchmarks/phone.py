@@ -54,7 +54,7 @@ class Studio:
     """
 
     def __init__(self, folder: Path) -> None:
-        command = [sys.executable, "-m", "morph_dslam.cli", "studio", str(folder), "--port", "0", "--phone"]
+        command = [sys.executable, "-m", "morph_dslam", "studio", str(folder), "--port", "0", "--phone"]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
     def __enter__(self) -> Studio:

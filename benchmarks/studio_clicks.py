@@ -33,7 +33,7 @@ class User:
     """Asks a studio as its page does; a context manager, as long as which the studio runs."""
 
     def __init__(self, folder: Path) -> None:
-        command = [sys.executable, "-m", "morph_dslam.cli", "studio", str(folder), "--port", "0"]
+        command = [sys.executable, "-m", "morph_dslam", "studio", str(folder), "--port", "0"]
         self._studio = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
     def __enter__(self) -> User:

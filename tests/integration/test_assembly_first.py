@@ -72,11 +72,11 @@ def test_the_order_enters_the_fingerprint_where_there_is_one() -> None:
         strip_study(True, supports=[{"kind": "fixed", "on": "x_min", "first": True}])
 
 
-def held_bar(rest: str | None, stretch: str = "0.2 mm", first: bool = True) -> SolidStudy:
-    """A viscoelastic bar, stretched first, whose end then moves sideways."""
+def held_bar(rest: str | None, stretch: str = "0.2 mm", first: bool = True, part: float | str = 0.6) -> SolidStudy:
+    """A viscoelastic bar, stretched first, whose end then moves sideways; ``part`` of its stiffness relaxes."""
     stretched = {"kind": "displacement", "on": "x_max", "x": stretch, "first": first}
     time = {"parameter": "age", "step": "0.5 s"} | ({"rest": rest} if rest else {})
-    prony = {"relative_moduli": [0.6], "times": ["2 s"]}
+    prony = {"relative_moduli": [part], "times": ["2 s"]}
     return strip_study(
         False,
         mesh={"generator": "block", "size": ["20 mm", "4 mm", "4 mm"], "divisions": [2, 1, 1], "cells": "hex8"},
@@ -87,7 +87,12 @@ def held_bar(rest: str | None, stretch: str = "0.2 mm", first: bool = True) -> S
             {"kind": "displacement", "on": "x_max", "y": "side", "z": "0 mm"},
         ],
         loads=[],
-        parameters={"side": {"range": ["0 mm", "0.5 mm"]}, "age": {"range": ["0 s", "4 s"]}},
+        parameters={
+            "side": {"range": ["0 mm", "0.5 mm"]},
+            "age": {"range": ["0 s", "4 s"]},
+            "pull": {"range": ["0.2 mm", "4 mm"]},
+            "g": {"range": [0.1, 0.8]},
+        },
         time=time,
     )
 
@@ -99,11 +104,21 @@ def test_what_is_applied_first_relaxes_while_it_rests() -> None:
     for rest, seconds in ((None, 0.0), ("3 s", 3.0), ("1000 h", np.inf)):
         sweep = held_bar(rest).sweep_problem()
         for age in (0.0, 4.0):
-            state = sweep.advance(sweep.first_state(), np.array([0.0, age]))
+            state = sweep.advance(sweep.first_state(), np.array([0.0, age, 0.0, 0.0]))
             force = float(sweep.take_snapshot(state).outputs["force_x_max"][0])
             fresh = fresh or force
             expected = 0.4 + 0.6 * np.exp(-(seconds + age) / 2.0)
             assert force / fresh == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_rests_does_so_at_the_parameters_of_the_sample() -> None:
+    """Without contraction P = E / 2 (s - 1 / s) at once, and the part 1 - g (1 - exp(-t / tau)) of it is left."""
+    sweep = held_bar("3 s", stretch="pull", part="g").sweep_problem()
+    for g, pull, age in ((0.8, 4e-3, 0.0), (0.1, 2e-3, 4.0), (0.5, 0.2e-3, 4.0)):
+        state = sweep.advance(sweep.first_state(), np.array([0.0, age, pull, g]))
+        force, stretch = sweep.take_snapshot(state).outputs["force_x_max"][0], 1.0 + pull / 0.02
+        left = 1.0 - g * (1.0 - np.exp(-(3.0 + age) / 2.0))
+        assert force == pytest.approx(16e-6 * 1.5e6 * (stretch - 1.0 / stretch) * left, rel=1e-8)
 
 
 def test_mistakes_in_a_rest_are_named() -> None:

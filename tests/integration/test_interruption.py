@@ -34,7 +34,7 @@ if __name__ == "__main__":
 
 def start(study: Path, output: Path) -> subprocess.Popen:
     """A build on two worker processes, in a process group of its own."""
-    command = [sys.executable, "-m", "morph_dslam.cli", "build", str(study), "-o", str(output), "--workers", "2"]
+    command = [sys.executable, "-m", "morph_dslam", "build", str(study), "-o", str(output), "--workers", "2"]
     return subprocess.Popen(
         command,
         stderr=subprocess.PIPE,

@@ -97,7 +97,7 @@ def test_the_run_is_that_of_the_command_line(project, tmp_path):
     given = ["--model", "model.morph", "--camera", str(film / "camera.yaml"), "--landmarks", "landmarks.csv"]
     given += ["--at-rest", "--reference-frame", "0"]
     for words in (["build", "study.toml", "-o", "model.morph"], ["track", str(film / "frames"), *given, "-o", "run"]):
-        subprocess.run([sys.executable, "-m", "morph_dslam.cli", *words], cwd=tmp_path, check=True, capture_output=True)
+        subprocess.run([sys.executable, "-m", "morph_dslam", *words], cwd=tmp_path, check=True, capture_output=True)
     model, again = load_model(folder / "model.morph"), load_model(tmp_path / "model.morph")
     np.testing.assert_allclose(model.nodes, again.nodes, rtol=0, atol=0)
     with h5py.File(folder / "run/result.h5") as studio, h5py.File(tmp_path / "run/result.h5") as line:

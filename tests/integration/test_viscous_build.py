@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from morph_dslam import load_model
+from morph_dslam import load_model, make_study
 from morph_dslam.cli import app as cli
+from morph_dslam.errors import StudyError
 from morph_dslam.model import ReducedModel
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.solid_sweep import ViscousSweep
 from tests.support.block_study import sliding
+from tests.support.closed_form_stress import lame
 
 BAR = """
 name = "bar"
@@ -72,3 +78,70 @@ def test_a_support_moves_with_time(tmp_path: Path) -> None:
         stress = 3e6 * 1e-4 / 5.0 * (0.4 * time + 0.6 * relaxing)
         found = model.von_mises(np.array([time]), "solid")
         assert found == pytest.approx(np.full(len(model.nodes), stress), rel=5e-4)
+
+
+#: The same bar with what may change from sample to sample: at t = 0 none of it is any default's.
+VARIED = {
+    "name": "bar",
+    "mesh": {"generator": "block", "size": ["10 mm", "10 mm", "20 mm"], "divisions": [1, 1, 2], "cells": "hex8"},
+    "parameters": {
+        "held": {"range": ["0 s", "20 s"]},
+        "g": {"range": [0.0, 0.8], "default": 0.4},
+        "k": {"range": [0.0, 0.5]},
+        "tau": {"range": ["1 s", "8 s"]},
+        "young": {"range": ["1 MPa", "4 MPa"]},
+        "load": {"range": ["0 mm", "6 mm"]},
+    },
+    "solver": {"threads": 1},
+}
+SIDES = [{"kind": "displacement", "on": f"{axis}_min", axis: "0 mm"} for axis in "xyz"]
+
+
+def varied(prony: dict, poisson: float, step: str, **others: Any) -> ViscousSweep:
+    """The sweep of that bar; parameters that nothing names do not matter here."""
+    law = {"law": "neo_hookean", "young": "young", "poisson": poisson, "prony": prony}
+    content = VARIED | {"materials": {"rubber": law}, "time": {"parameter": "held", "step": step}} | others
+    study = make_study(content)
+    assert isinstance(study, SolidStudy)
+    sweep = study.sweep_problem()
+    assert isinstance(sweep, ViscousSweep)
+    return sweep
+
+
+def test_each_sample_has_the_history_of_its_own_parameters() -> None:
+    """Without contraction P = E / 2 (s - 1 / s) at once, and the part 1 - g (1 - exp(-t / tau)) of it is left."""
+    pulled = [*SIDES, {"kind": "displacement", "on": "z_max", "z": "load"}]
+    sweep = varied({"relative_moduli": ["g"], "times": ["tau"]}, 0.0, "5 s", supports=pulled)
+    start = sweep.first_state()
+    for g, tau, young, load in product((0.0, 0.1, 0.8), (1.0, 8.0), (1e6, 4e6), (2e-3, 6e-3)):
+        stretch = 1.0 + load / 0.02
+        at_once = 1e-4 * young / 2.0 * (stretch - 1.0 / stretch)
+        for held in (0.0, 4.0, 20.0):
+            start = sweep.advance(start, np.array([held, g, 0.0, tau, young, load]))
+            force = sweep.take_snapshot(start).outputs["force_z_max"][2]
+            assert force == pytest.approx(at_once * (1.0 - g * (1.0 - np.exp(-held / tau))), rel=1e-8)
+
+
+@pytest.mark.parametrize("cells", ["hex8", "tet10"])
+def test_the_volume_relaxes_by_parameters_that_are_zero_by_default(cells: str) -> None:
+    """Creep between walls under a stress s: the modulus M = lambda + 2 mu relaxes by the part m.
+
+    The strain is s / M (1 + m / (1 - m) (1 - exp(-(1 - m) t / tau))).
+    """
+    walls = [{"kind": "displacement", "on": f"{axis}_max", axis: "0 mm"} for axis in "xy"]
+    prony = {"relative_moduli": ["g"], "times": ["tau"], "bulk_moduli": ["k"]}
+    weight = [{"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-1 Pa"]}]
+    mesh = {"generator": "block", "size": ["10 mm", "10 mm", "20 mm"], "divisions": [1, 1, 2], "cells": cells}
+    sweep = varied(prony, 0.4, "0.2 s", supports=[*SIDES, *walls], loads=weight, mesh=mesh)
+    lam, shear = lame(4e6, 0.4)
+    for g, k in ((0.0, 0.5), (0.8, 0.0), (0.6, 0.3)):
+        m = (k * lam + g * 2.0 * shear) / (lam + 2.0 * shear)
+        state = sweep.advance(sweep.first_state(), np.array([4.0, g, k, 2.0, 4e6, 0.0]))
+        strain = np.abs(sweep.take_snapshot(state).fields["displacement"][:, 2]).max() / 0.02
+        crept = 1.0 + m / (1.0 - m) * (1.0 - np.exp(-(1.0 - m) * 4.0 / 2.0))
+        assert strain == pytest.approx(crept / (lam + 2.0 * shear), rel=1e-3)
+
+
+def test_relative_moduli_that_can_sum_to_one_are_refused() -> None:
+    with pytest.raises(StudyError, match=r"sum below 1 .* where g = 0.8, k = 0.5, young = 1 MPa: change"):
+        varied({"relative_moduli": ["g", "k"], "times": ["1 s", "9 s"]}, 0.0, "5 s", supports=SIDES)

@@ -59,7 +59,7 @@ def test_expression_is_the_same_function_of_other_variables():
     ("text", "quantity", "message"),
     [
         ("3", "stress", r"'3' lacks a unit of stress: Pa, kPa"),
-        (3.0, "length", r'with its unit, "3\.0 m" for example'),
+        (3.0, "length", r'with its unit, "3\.0 mm" for example'),
         (True, "ratio", r"True is not a number"),
         ("3 mm", "stress", r"'mm' is not a unit of stress"),
         ("weight", "stress", r"names 'weight', which is no parameter; the parameters are load, share, tilt"),

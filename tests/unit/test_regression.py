@@ -86,3 +86,17 @@ def test_too_high_a_degree_is_not_chosen_for_noisy_values() -> None:
     functions, errors = fit_functions(x, values, gradients, LOWER, UPPER, 8, np.arange(80))
     assert functions.multi_indices.sum(axis=1).max() <= 4
     assert errors[2] < errors[max(errors)]
+
+
+def test_a_weighted_sample_is_met_more_closely() -> None:
+    """A parabola cannot follow the sine; where the weight is, it must."""
+    x = samples(80, 4)
+    x[0] = LOWER
+    values, at_corner = np.sin(2.0 * x[:, :1]), np.sin(-4.0)
+    missed = []
+    for weight in (1.0, 1e3):
+        weights = np.where(np.arange(80) == 0, weight, 1.0)
+        functions, _ = fit_functions(x, values, None, LOWER, UPPER, 2, np.arange(80), weights=weights)
+        missed.append(abs(functions.evaluate(LOWER)[0][0] - at_corner))
+    assert missed[0] > 0.1
+    assert missed[1] < 1e-4

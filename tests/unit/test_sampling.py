@@ -40,6 +40,7 @@ def test_more_sobol_samples_contain_the_fewer(fewer: int) -> None:
     many = training_samples(study({"scheme": "sobol", "training": 257, "seed": 3}))
     assert few.shape == (fewer, 3)
     np.testing.assert_array_equal(many[:fewer], few)
+    np.testing.assert_array_equal(few[0], [0.0, 0.0, 1e4], "the defaults come first")
     assert len(np.unique(many, axis=0)) == 257
 
 
@@ -58,7 +59,7 @@ def test_more_held_out_samples_contain_the_fewer_and_are_uniform_and_independent
 
 def test_adaptive_sampling_starts_with_the_first_and_chooses_among_those_that_follow() -> None:
     adaptive = study({"scheme": "adaptive", "training": 64, "first": 10})
-    scattered = training_samples(study({"scheme": "sobol", "training": 64}))
+    scattered = training_samples(study({"scheme": "sobol", "training": 65}))[1:]
     np.testing.assert_array_equal(training_samples(adaptive), scattered[:10])
     np.testing.assert_array_equal(candidate_samples(adaptive, 30), scattered[10:40])
     np.testing.assert_array_equal(candidate_samples(adaptive, 54), scattered[10:])

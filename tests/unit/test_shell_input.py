@@ -1,5 +1,6 @@
 """What a shell's study refuses, what its mesh generators make, and what it reads from files."""
 
+import re
 import tomllib
 
 import meshio
@@ -77,6 +78,7 @@ def test_a_study_of_a_surface_with_a_branch_ends_with_one_message(tmp_path, caps
         ({"sets": {"tip": {}}}, "either nearest, or a region"),
         ({"mesh": {"file": "sheet.vtu", "unit": "m", "size": "1 mm"}}, "size"),
         ({"shell": {"thickness": "1 mm * part"}}, "part"),
+        ({"shell": {"thickness": 1.5}}, 'write 1.5 with its unit, "1.5 mm" for example'),
         ({"shell": {"thickness": "1 mm * a"}}, "thickness = 0 mm must be positive where a = 0: change its range"),
         ({"shell": {"thickness": "1 mm - 2 mm * a"}}, "thickness = -1 mm must be positive where a = 1"),
     ],
@@ -149,6 +151,65 @@ def test_second_order_surfaces_are_read(kind, tmp_path):
     read = load_surface_mesh(tmp_path / "cylinder.vtu", "m")
     np.testing.assert_array_equal(read.blocks[0].connectivity, made.blocks[0].connectivity)
     np.testing.assert_allclose(read.nodes, made.nodes)
+
+
+def sector(angles, radii):
+    """Points (n, 2) on a ring by degrees and radius."""
+    turns = np.radians(np.array(angles))
+    return np.array(radii)[:, None] * np.column_stack([np.cos(turns), np.sin(turns)])
+
+
+@pytest.mark.parametrize(
+    ("element", "cells", "points", "area"),
+    [
+        # Corners, then the middles of the edges 1-2, 2-3 and so on: two sectors, whose curved sides are exact to 1e-5.
+        ("STRI65", "tri6", sector([0, 0, 30, 0, 15, 30], [0, 2, 2, 1, 2, 1]), np.pi / 3),
+        ("S6", "tri6", sector([0, 0, 30, 0, 15, 30], [0, 2, 2, 1, 2, 1]), np.pi / 3),
+        ("S8", "quad8", sector([0, 0, 30, 30, 0, 15, 30, 15], [1, 2, 2, 1, 1.5, 2, 1.5, 1]), np.pi / 4),
+        ("S8R", "quad8", sector([0, 0, 30, 30, 0, 15, 30, 15], [1, 2, 2, 1, 1.5, 2, 1.5, 1]), np.pi / 4),
+        ("S8R5", "quad8", sector([0, 0, 30, 30, 0, 15, 30, 15], [1, 2, 2, 1, 1.5, 2, 1.5, 1]), np.pi / 4),
+    ],
+)
+def test_abaqus_shells_of_second_order_are_read(tmp_path, element, cells, points, area):
+    labels = ", ".join(str(i + 1) for i in range(len(points)))
+    nodes = "".join(f"{i + 1}, {x!r}, {y!r}, 0.\n" for i, (x, y) in enumerate(points.tolist()))
+    (tmp_path / "part.inp").write_text(f"*NODE\n{nodes}*ELEMENT, TYPE={element}\n7, {labels}\n")
+    mesh = load_surface_mesh(tmp_path / "part.inp", "m")
+    (block,) = mesh.blocks
+    assert block.cell_type == cells
+    assert (jacobian_determinants(mesh, block) @ block.type.quadrature()[1]).sum() == pytest.approx(area, rel=3e-4)
+
+
+PANEL = """
+mesh = { generator = "cylinder", radius = "60 mm", length = "20 mm", angles = ["0 deg", "90 deg"], divisions = [1, 8] }
+shell = { thickness = "1 mm" }
+material = { young_fibre = "8 GPa", young_cross = "3 GPa", poisson = 0.3, shear = "1 GPa", fibre = [0, 1, 0] }
+supports = [{ kind = "clamped", on = "start" }]
+"""
+
+
+def test_fibres_that_turn_abruptly_are_warned_of():
+    """The normal is within asin(0.1) = 5.74 degrees of y on 6.4 % of a quarter of a cylinder."""
+    (sentence,) = shell_study(PANEL).doubts()
+    said = re.search(
+        r"fibre = \[0.0, 1.0, 0.0\] is within 6 degrees of the normal on ([\d.]+) % of the shell", sentence
+    )
+    assert said is not None
+    assert float(said[1]) == pytest.approx(6.4, abs=0.5)
+    assert "run along z there" in sentence
+    for fibre in ("[0, 0, 1]", "[0, 1, 1]"):
+        assert not shell_study(PANEL.replace("[0, 1, 0]", fibre)).doubts()
+    assert not shell_study(STRIP.replace("poisson = 0.3", "poisson = 0.3, fibre = [0, 0, 1]")).doubts()
+
+
+@pytest.mark.parametrize(("most", "said"), [("0.1 N/mm", None), ("9.5 N/mm", None), ("15 N/mm", 29)])
+def test_loads_far_too_large_for_a_shell_are_asked_about(most, said):
+    """The tip of a strip moves by 4 q l^3 / (E t^3), 20 times its size of 44.7 mm for 10.3 N/mm."""
+    edge = '{ kind = "edge", on = "x_max", force = ["0 N/m", "0 N/m", "push"] }'
+    text = STRIP.replace("0.3", "0.0").replace('"1 mm"', '"1.432 mm"') + f"loads = [{edge}]\n"
+    study = shell_study(text + f'parameters = {{ push = {{ range = ["0 N/mm", "{most}"] }} }}')
+    assert ("are their units" in study.advice) == (said is not None)
+    assert said is None or f"push = {most} would move the shell by {said} times its size" in study.advice
 
 
 def test_an_open_stl_is_a_surface(tmp_path):

@@ -105,3 +105,21 @@ def test_relaxation(cell_type: str) -> None:
 def test_a_viscous_material_needs_a_time() -> None:
     with pytest.raises(StudyError, match="which parameter is the time"):
         SolidProblem(block((1.0, 1.0, 1.0), (1, 1, 1), "hex8"), {"all": LAW}, [fixed("x_min")])
+
+
+@pytest.mark.parametrize("cell_type", ["hex8", "tet10"])
+def test_derivatives_by_the_constants_of_a_series_at_a_fixed_history(cell_type: str) -> None:
+    symbols = load_parameter(pull=0.0, time=0.0, g=0.3, tau=2.0)
+    law = NeoHookean(young=3.0, poisson=0.3, prony=Prony((symbols["g"],), (symbols["tau"],)))
+    supports = [*ROLLERS, PrescribedDisplacement("x_max", x=symbols["pull"])]
+    mesh = block((1.0, 1.0, 1.0), (1, 1, 1), cell_type)
+    problem = SolidProblem(mesh, {"all": law}, supports, parameters=symbols, time=symbols["time"])
+    state = advance(problem, problem.initial_state(), np.array([0.5, 0.0, 0.3, 2.0]))[-1]
+    mu, steps = np.array([0.6, 1.5, 0.4, 3.0]), 1e-5 * np.eye(4)
+    slopes = problem.residual_slopes(state.dofs, mu)
+    for k in (2, 3):
+        ends = [problem.residual(state.dofs, mu + sign * steps[k]) for sign in (1.0, -1.0)]
+        np.testing.assert_allclose(slopes[k], (ends[0] - ends[1]) / 2e-5, atol=1e-8)
+        assert np.abs(slopes[k]).max() > 1e-3
+    with pytest.raises(StudyError, match="a Prony series changes along a path"):
+        advance(problem, state, mu)

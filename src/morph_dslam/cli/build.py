@@ -8,6 +8,8 @@ from morph_dslam.cli.arguments import LENGTH_UNITS, add_file, add_output, positi
 from morph_dslam.errors import StudyError
 
 HELP = "solve a study over its parameters and compress the solutions in a model file, or make one of a rigid surface"
+#: Ends of the names of surface files.
+SURFACES = (".stl", ".obj", ".ply")
 KEPT = "the solutions found so far are kept, and the same command goes on from there"
 
 
@@ -51,6 +53,11 @@ def run(arguments: argparse.Namespace) -> None:
 def _build_study(arguments: argparse.Namespace) -> None:
     if arguments.unit is not None:
         raise StudyError("--unit is of a surface (--rigid); a study file states its units itself")
+    if arguments.study.suffix.lower() in SURFACES:
+        raise StudyError(
+            f"{arguments.study} is a surface, not a study file: a rigid object is built with --rigid "
+            f"{arguments.study.name} and --unit, and a deformable one from a study that names the file as its mesh"
+        )
     build_study(arguments.study, arguments.output, arguments.workers, arguments.reference_curve)
 
 

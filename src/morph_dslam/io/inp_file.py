@@ -26,6 +26,7 @@ ELEMENTS = {
     "C3D15": ("prism15", 15), "C3D20": ("hex20", 20), "C3D27": ("hex27", 27),
     "S3": ("tri3", 3), "S4": ("quad4", 4), "S6": ("tri6", 6), "STRI65": ("tri6", 6), "S8": ("quad8", 8),
 }  # fmt: skip
+_ELEMENT_TYPE = re.compile(rf"({'|'.join(ELEMENTS)})([A-Z]+\d?)?")
 _GENERATING = (
     "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SUBMODEL", "SYMMETRIC MODEL GENERATION",
 )  # fmt: skip
@@ -104,8 +105,8 @@ def element_type(card: Card) -> tuple[str, int]:
     if "INPUT" in card.parameters:
         raise card.line.error("*ELEMENT with INPUT= is not read; use *INCLUDE")
     name = card.required("TYPE").upper()
-    match = re.fullmatch(r"(C3D\d+|S[34])([A-Z]*\d?)", name)
-    if match is None or match[1] not in ELEMENTS:
+    match = _ELEMENT_TYPE.fullmatch(name)
+    if match is None:
         raise card.line.error(
             f"element type {name} is not known; use {', '.join(ELEMENTS)} (with any suffix), or take these "
             "elements out (Gmsh adds lines and surfaces to an .inp: save a .msh instead)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,16 +61,23 @@ class ShellMaterial:
         if not np.linalg.norm(self.fibre) > 0.0:
             raise StudyError(f"the fibre {tuple(self.fibre)} has no direction")
 
+    @property
+    def next_axis(self) -> int:
+        """The axis that takes the place of the given direction where this says nothing on the surface."""
+        return (int(np.argmax(np.abs(self.fibre))) + 1) % 3
+
+    def outside(self, normal: Any) -> Any:
+        """Positive where the given direction is more than about 6 degrees off this unit ``normal``."""
+        return ngs.Norm(_projected(self.fibre, normal)) / float(np.linalg.norm(self.fibre)) - ALONG
+
     def frame(self, normal: Any) -> tuple[Any, Any]:
         """Unit vectors along and across the fibres on a surface with this unit ``normal``.
 
         Where the given direction is within about 6 degrees of the normal, it is the next of the axes x, y and z,
         cyclically from its largest component.
         """
-        given = np.array(self.fibre, dtype=float) / np.linalg.norm(self.fibre)
-        other = np.roll(np.eye(3), 1, axis=1)[int(np.argmax(np.abs(given)))]
-        tangents = [d - (d * normal) * normal for d in (ngs.CF(tuple(given)), ngs.CF(tuple(other)))]
-        along = ngs.IfPos(ngs.Norm(tangents[0]) - ALONG, tangents[0], tangents[1])
+        other = np.eye(3)[self.next_axis]
+        along = ngs.IfPos(self.outside(normal), _projected(self.fibre, normal), _projected(other, normal))
         along = along / ngs.Norm(along)
         across = ngs.Cross(normal, along)
         if isinstance(self.fibre_angle, (int, float)) and self.fibre_angle == 0.0:
@@ -81,6 +89,12 @@ class ShellMaterial:
         """1/2 S : compliance : S of a stress in the frame along and across the fibres."""
         direct = (s11 * s11 - 2.0 * self.poisson * s11 * s22) / self.young_fibre + s22 * s22 / self.young_cross
         return 0.5 * (direct + s12 * s12 / self.shear)
+
+
+def _projected(direction: Iterable[float], normal: Any) -> Any:
+    """The part of a direction (3,) along the surface with this unit normal."""
+    given = ngs.CF(tuple(float(x) for x in direction))
+    return given - (given * normal) * normal
 
 
 def isotropic(young: Scalar, poisson: Scalar, **others: Any) -> ShellMaterial:

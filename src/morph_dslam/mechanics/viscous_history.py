@@ -9,6 +9,8 @@ which is exact while the strain rests and of second order otherwise. In each ste
 incremental potential, so that NGSolve differentiates viscous laws as it does elastic ones:
 
     W_step(F) = (g_inf + sum_i g_i e_i) W(F) + H : E,   H = sum_i e_i^2 Q_i_old - g_i e_i S0_old
+
+The Q_i belong to the g_i and tau_i that they were made with: a path along which these change is refused.
 """
 
 from __future__ import annotations
@@ -77,6 +79,8 @@ class ViscousHistory:
         # Q_i of each term, then the instantaneous stresses of the remainder and of the volumetric part.
         self._overstress = [self._field() for _ in range(max(len(prony.times) for prony in series))]
         self._instant = [self._field(), self._field()]
+        self._constants = [c for prony in series for c in (*prony.relative_moduli, *prony.times, *prony.bulk)]
+        self._remembers: list[float] | None = None
         self.regions = [self._with_memory(region) for region in regions]
 
     def _field(self) -> ngs.GridFunction:
@@ -105,7 +109,17 @@ class ViscousHistory:
             )
 
     def advance(self, F: Any) -> None:
-        """Accept the solution with the deformation gradient ``F``, at the present parameters."""
+        """Accept the solution with the deformation gradient ``F``, at the present parameters.
+
+        Raises StudyError if a Prony series has changed since the last solution that was accepted.
+        """
+        constants = [self._symbols.value(constant) for constant in self._constants]
+        if self._remembers is not None and self._remembers != constants:
+            raise StudyError(
+                "a Prony series changes along a path of solutions: begin another path for each series, or lead to its "
+                "beginning with remember=False"
+            )
+        self._remembers = constants
         stresses = {id(region): _instant_stresses(region.material, F) for region in self.regions}
         new = [self._interpolated(lambda region, part=part: stresses[id(region)][part]) for part in (0, 1)]
         count = len(self._overstress)
@@ -139,6 +153,7 @@ class ViscousHistory:
         for field, part in zip(fields, np.split(np.asarray(values[:-1]), len(fields)), strict=True):
             field.vec.FV().NumPy()[:] = part
         self._accepted.Set(float(values[-1]))
+        self._remembers = None
 
     def remembered_at(self, points: NDArray) -> Array:
         """Stress left from earlier steps at NGSolve's mesh points: second Piola-Kirchhoff (p, 3, 3), Pa.

@@ -29,6 +29,8 @@ from morph_dslam.studies.problem import Snapshot
 Array = NDArray[np.float64]
 #: Bases that interpolate on a grid, and error of a separated form there as a part of the tolerance.
 GRID_BASES, SHARE = ("cubic_spline", "hat"), 0.2
+#: Weight in a regression of the solution at the defaults, which mostly is the unloaded body at rest.
+DEFAULT_WEIGHT = 3.0
 #: Modes that those kept are chosen from: to this part of the tolerance, and so many times ``max_modes``.
 FINER, MORE_MODES = 0.1, 3
 
@@ -122,8 +124,21 @@ def _on_grid(task: ReductionTask, grid: EvenGrid, coefficients: Array) -> tuple[
 def _fitted(task: ReductionTask, coefficients: Array, slopes: Array | None) -> tuple[Functions, dict[str, Any]]:
     """Polynomials fitted to the coefficients (n_snapshots, n_modes) of a field at scattered samples."""
     options, box = task.options, task.box
+    at_defaults = np.isclose(
+        task.samples, [p.default for p in task.parameters], rtol=0.0, atol=1e-9 * np.ptp(box, axis=1)
+    )
+    weights = np.where(at_defaults.all(axis=1), DEFAULT_WEIGHT, 1.0)
+    lower, upper = box.T
     functions, errors = fit_functions(
-        task.samples, coefficients, slopes, box[:, 0], box[:, 1], options.max_degree, task.labels, raise_single=True
+        task.samples,
+        coefficients,
+        slopes,
+        lower,
+        upper,
+        options.max_degree,
+        task.labels,
+        raise_single=True,
+        weights=weights,
     )
     summary = {
         "format": options.format or "polynomial",

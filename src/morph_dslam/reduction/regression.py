@@ -69,16 +69,23 @@ class _Trial:
 
 
 class _Regression:
-    """Samples (n, d) in a box, with targets (1 or 1 + d, n, n_functions) by the scaled parameters."""
+    """Samples (n, d) in a box, with targets (1 or 1 + d, n, n_functions) by the scaled parameters, and weights (n,)."""
 
     def __init__(
-        self, samples: Array, targets: Array, box: Array, folds: NDArray[np.int64], gradient_weight: float
+        self,
+        samples: Array,
+        targets: Array,
+        box: Array,
+        folds: NDArray[np.int64],
+        gradient_weight: float,
+        weights: Array,
     ) -> None:
         order = np.argsort(folds, kind="stable")
         ends = np.cumsum(np.bincount(folds, minlength=FOLDS))
         self._folds = [slice(end - size, end) for end, size in zip(ends, np.diff(ends, prepend=0), strict=True)]
         self._box, self._samples = box, samples[order]
-        self._weights = np.where(np.arange(len(targets)) == 0, 1.0, gradient_weight)[:, None, None]
+        of_kinds = np.where(np.arange(len(targets)) == 0, 1.0, gradient_weight)
+        self._weights = np.multiply.outer(of_kinds, weights[order])[:, :, None]
         self._targets = targets[:, order] * self._weights
 
     def suits(self, indices: NDArray[np.int64]) -> bool:
@@ -120,6 +127,7 @@ def fit_functions(
     groups: NDArray[np.int64],
     gradient_weight: float = 0.3,
     raise_single: bool = False,
+    weights: Array | None = None,
 ) -> tuple[ParameterFunctions, dict[int, float]]:
     """Polynomials of the total degree that predicts left-out samples best.
 
@@ -132,6 +140,7 @@ def fit_functions(
     gradient_weight : weight of gradients (over the half range) relative to values.
     raise_single : whether parameters may have higher degrees than the others where that predicts clearly
         better, up to three times ``max_degree``.
+    weights : (n,) of the samples; 1 each if absent.
 
     Returns
     -------
@@ -142,7 +151,8 @@ def fit_functions(
     if gradients is not None:
         targets = np.concatenate([targets, np.moveaxis(gradients * half[None, :, None], 1, 0)])
     d = samples.shape[1]
-    fit = _Regression(samples, targets, np.array([lower, upper]), groups % FOLDS, gradient_weight)
+    weights = np.ones(len(samples)) if weights is None else weights
+    fit = _Regression(samples, targets, np.array([lower, upper]), groups % FOLDS, gradient_weight, weights)
     errors: dict[int, float] = {}
     best: _Trial | None = None
     for degree in range(2, max_degree + 1):

@@ -203,7 +203,7 @@ def draw_overlay(
     colour_map : a matplotlib colour map.
     alpha : opacity of the surface, 0 to 1.
     brightness : (n,) factor on the colour at each node, for example from `shading.lambert`; 1 by default.
-    caption : a line of text for the lower left corner.
+    caption : text for the lower left corner.
     closed : see `rasterise`.
     bar : place of the colour bar, kept from frame to frame; chosen by this image alone if None.
 
@@ -226,8 +226,8 @@ def draw_overlay(
         panel = (bar or BarPlace()).choose(painted, _bar_panels((height, width), margin, upright, flat))
         _blend_panel(result, panel.image, panel.top, panel.left)
     if caption:
-        line = text_patch(caption, scale)
-        _blend_panel(result, line, height - margin - line.shape[0], margin)
+        lines = text_patch(caption, scale, width - 2 * margin)
+        _blend_panel(result, lines, height - margin - lines.shape[0], margin)
     return result
 
 

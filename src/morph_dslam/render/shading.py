@@ -72,12 +72,29 @@ def colour_table(name: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(colours[:, 2::-1])
 
 
-def text_patch(text: str, scale: float) -> NDArray[np.uint8]:
-    """A dark patch (height, width, 3) with one line of text."""
-    (width, height), below = cv2.getTextSize(text, FONT, scale, 1)
-    patch = np.full((height + below + 4, width + 4, 3), BACKGROUND, dtype=np.uint8)
-    cv2.putText(patch, text, (2, height + 2), FONT, scale, (250, 250, 250), 1, cv2.LINE_AA)
+def text_patch(text: str, scale: float, widest: int | None = None) -> NDArray[np.uint8]:
+    """A dark patch (height, width, 3) with text, in one line, or in as many as ``widest`` pixels ask for."""
+    lines = [text] if widest is None else _wrapped(text, scale, widest - 4)
+    sizes = [cv2.getTextSize(line, FONT, scale, 1) for line in lines]
+    width, height = (max(size[axis] for size, _ in sizes) for axis in (0, 1))
+    step = height + max(below for _, below in sizes) + 4
+    patch = np.full((step * len(lines), width + 4, 3), BACKGROUND, dtype=np.uint8)
+    for number, line in enumerate(lines):
+        place = (2, number * step + height + 2)
+        cv2.putText(patch, line, place, FONT, scale, (250, 250, 250), 1, cv2.LINE_AA)
     return patch
+
+
+def _wrapped(text: str, scale: float, widest: int) -> list[str]:
+    """Lines of whole words, each as long as fits into so many pixels."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and cv2.getTextSize(longer, FONT, scale, 1)[0][0] <= widest:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines or [text]
 
 
 def _paste(panel: NDArray[np.uint8], patch: NDArray[np.uint8], top: int, left: int) -> None:

@@ -22,6 +22,7 @@ from morph_dslam.units import FACTORS, quantity_of, to_si
 Array = NDArray[np.float64]
 #: No number of a study is meant where it is larger, in whatever unit: what follows from it could overflow.
 LARGEST = 1e30
+_USUAL_UNITS = {"length": "mm", "stress": "MPa", "pressure": "kPa", "angle": "deg"}
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _WORD = r"[A-Za-z_][\w./]*"
 _TERM = re.compile(
@@ -78,8 +79,7 @@ def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter
         raise StudyError(f"{value!r} is not a number with a unit, nor an expression of parameters")
     if not isinstance(value, str):
         if quantity not in ("ratio", None):
-            unit = next(iter(FACTORS[quantity]))
-            raise StudyError(f'write {value} with its unit, "{value} {unit}" for example')
+            raise StudyError(f'write {value} with its unit, "{value} {usual_unit(quantity)}" for example')
         return Affine(possible(float(value), str(value)), (0.0,) * len(parameters))
     known = {parameter.name: index for index, parameter in enumerate(parameters)}
     quantity = quantity or _own_quantity(value, known, parameters)
@@ -91,6 +91,11 @@ def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter
         else:
             slopes[known[name]] += sign * number
     return Affine(constant, tuple(slopes.tolist()))
+
+
+def usual_unit(quantity: str) -> str:
+    """A unit in which numbers of a study are mostly meant, for examples in messages."""
+    return _USUAL_UNITS.get(quantity) or next(iter(FACTORS[quantity]))
 
 
 def possible(number: float, text: str) -> float:

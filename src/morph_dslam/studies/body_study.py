@@ -80,8 +80,9 @@ _MOST_COMBINED = 8
 def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter]) -> None:
     """Read every value of sections with ``make``, so that a mistake is found before anything is solved.
 
-    Materials, thicknesses, radii of obstacles and foundations are checked at the defaults of the parameters, and at
-    both ends of the range of each that they depend on. Raises ValueError saying in which of the ``parts``, named
+    Materials, thicknesses, radii of obstacles and foundations are checked at the defaults of the parameters and at both
+    ends of the range of each that they depend on; all but elastic materials also at the combinations of these ends, for
+    the relative moduli of a Prony series must not sum to 1. Raises ValueError saying in which of the ``parts``, named
     sections, the mistake is, and at which value of a parameter if that is its cause.
     """
     defaults = np.array([p.default for p in parameters])
@@ -94,7 +95,8 @@ def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter])
             raise ValueError(f"{where}: {error}{_changed_range(parameters, blamed, defaults)}") from error
         if not isinstance(made, _CHECKED):
             continue
-        for at, mu in range_ends(parameters, sorted(used), combined=not isinstance(made, (Material, ShellMaterial))):
+        elastic = isinstance(made, ShellMaterial) or (isinstance(made, Material) and made.prony is None)
+        for at, mu in range_ends(parameters, sorted(used), combined=not elastic):
             try:
                 _made(section, parameters, mu, set())
             except StudyError as error:

@@ -28,6 +28,7 @@ from morph_dslam.reduction.task import ReductionTask
 from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.discretisation import discretisation_errors
 from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.load_sizes import shell_load_doubt
 from morph_dslam.studies.problem import announce
 from morph_dslam.studies.provenance import provenance, study_warnings
 from morph_dslam.studies.sections import ReductionSection
@@ -122,6 +123,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     if isinstance(chosen, SolidStudy | ShellStudy):
         chosen.check_parameters_used()
         mesh_notes = _announce_mesh(chosen)
+    _announce_doubts(chosen)
     snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
     _check_held_out(chosen, snapshots, output)
     model = certified_model(snapshots, chosen.reduction, chosen.name, _fallback(study.reduction))
@@ -165,6 +167,13 @@ def _announce_mesh(study: SolidStudy | ShellStudy) -> list[str]:
     for note in (*notes, *many_cells_note(mesh)):
         announce(f"note: {note}")
     return notes
+
+
+def _announce_doubts(study: Study) -> None:
+    """Print what is probably not meant in a study, before it is solved for long."""
+    sized = shell_load_doubt(study.problem()).strip() if isinstance(study, ShellStudy) else ""
+    for sentence in filter(None, (*study_warnings(study), sized)):
+        announce(f"note: {sentence[0].lower()}{sentence[1:]}")
 
 
 def _unstrained(snapshots: Snapshots) -> list[str]:

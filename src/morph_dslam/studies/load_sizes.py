@@ -1,4 +1,4 @@
-"""Whether loads on surfaces go with the stiffness of a solid: what a message on solutions that failed may add."""
+"""Whether loads go with the stiffness of a body: what a message before solving, or on failed solutions, may add."""
 
 from __future__ import annotations
 
@@ -7,14 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.loads import Gravity
 from morph_dslam.mechanics.materials.base import Material, isotropic_average
+from morph_dslam.mechanics.shell_problem import ShellProblem
 from morph_dslam.model import Parameter
+from morph_dslam.model.reduced_model import state_text
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.body_study import numbered
+from morph_dslam.studies.body_study import numbered, range_ends
 from morph_dslam.studies.solid_sections import Value
 
 #: Loads of more than so many shear moduli carry no rubber's shape any more: their unit is probably wrong.
 MOST_MODULI = 20.0
+#: Loads that would move a shell by more than so many times its size, were it linear, have probably a wrong unit.
+MOST_SIZES = 20.0
 
 
 def load_doubt(loads: Iterable[Any], materials: Iterable[Any], parameters: Sequence[Parameter]) -> str:
@@ -32,6 +38,30 @@ def load_doubt(loads: Iterable[Any], materials: Iterable[Any], parameters: Seque
             return (
                 f"{where.capitalize()} reaches {_shown(largest)}, {largest / shear:.0f} times the shear modulus of the "
                 f"stiffest material ({_shown(shear)}): is its unit right? "
+            )
+    return ""
+
+
+def shell_load_doubt(problem: ShellProblem) -> str:
+    """A sentence if loads at the end of a range are far too large for a shell as stiff as it is undeformed; else "".
+
+    Gravity is left out: a cloth hangs by what its stiffness does not carry.
+    """
+    if any(isinstance(load, Gravity) for load in problem.loads):
+        return ""
+    parameters, undeformed, defaults = problem.symbols.parameters, np.zeros(problem.n_dofs), problem.symbols.default
+    try:
+        tangent = problem.linearise(undeformed, defaults)
+    except SolverError:
+        return ""
+    for at, mu in range_ends(parameters, list(range(len(parameters))), combined=False):
+        moved = problem.nodal_displacement(tangent.solve(problem.residual(undeformed, mu)))
+        sizes = float(np.linalg.norm(moved, axis=1).max()) / problem.length
+        if sizes > MOST_SIZES:
+            return (
+                f"The loads at {state_text([parameters[k] for k in at], mu[at])} would move the shell by {sizes:.0f} "
+                "times its size if it stayed as stiff as it is undeformed: are their units, and those of modulus and "
+                "thickness, right? "
             )
     return ""
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from morph_dslam.errors import StudyError
+from morph_dslam.studies.body_study import BodyStudy
 from morph_dslam.studies.problem import ParametricStudy, bounds
 
 Array = NDArray[np.float64]
@@ -29,8 +30,12 @@ def training_samples(study: ParametricStudy) -> Array:
     if sampling.scheme == "grid":
         axes = grid_axes(study)  # the last parameter runs fastest
         return study.admissible(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
-    count = sampling.first if sampling.scheme == "adaptive" else sampling.training
-    return sample_box(study, count, sampling.seed, TRAINING_TOWARDS_EDGES)
+    if sampling.scheme == "adaptive" or not isinstance(study, BodyStudy):
+        count = sampling.first if sampling.scheme == "adaptive" else sampling.training
+        return sample_box(study, count, sampling.seed, TRAINING_TOWARDS_EDGES)
+    # Scattered samples alone leave the corners of the box to extrapolation, and mostly the body is unloaded in one.
+    scattered = sample_box(study, sampling.training - 1, sampling.seed, TRAINING_TOWARDS_EDGES)
+    return np.vstack([study.root(), scattered])
 
 
 def candidate_samples(study: ParametricStudy, count: int) -> Array:

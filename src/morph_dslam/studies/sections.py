@@ -18,15 +18,15 @@ from pydantic import (
 
 from morph_dslam.errors import StudyError
 from morph_dslam.reduction.registry import reduction_method
-from morph_dslam.studies.affine import LARGEST, possible
-from morph_dslam.units import FACTORS, to_si
+from morph_dslam.studies.affine import LARGEST, possible, usual_unit
+from morph_dslam.units import to_si
 
 
 def quantity(kind: str) -> BeforeValidator:
     """Reads "420 mm" as SI; refuses a bare number, so that no unit is ever guessed."""
 
     def read(value: Any) -> float:
-        example = "mm" if kind == "length" else next(iter(FACTORS[kind]))
+        example = usual_unit(kind)
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError(f'write a number with its unit in quotes, "20 {example}" for example')
         if not isinstance(value, str):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Annotated, Any, Literal
 
+import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
@@ -15,6 +16,8 @@ from morph_dslam.mechanics import loads, supports
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.shell_material import ShellMaterial, isotropic
 from morph_dslam.mechanics.shell_supports import Clamp, SymmetryPlane, clamped
+from morph_dslam.mechanics.spaces import DisplacementSpace
+from morph_dslam.mechanics.surface_mesh import SurfaceMesh
 from morph_dslam.meshing import surface_generators
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_surface_mesh
@@ -51,6 +54,8 @@ CellName = Literal["tri3", "tri6", "quad4", "quad8", "quad9"]
 Divisions = Annotated[tuple[Count, Count], AfterValidator(few_cells)]
 #: The largest thickness as a part of the size.
 THICKEST = 0.05
+#: Added to the order of quadrature where a part of a cell is measured.
+FINE = 10
 FULL_TURN = (0.0, surface_generators.FULL_TURN)
 
 
@@ -234,6 +239,25 @@ class ShellMaterialSection(Section):
 
     def _stress(self, name: str, read: Reader) -> Any:
         return read(getattr(self, name), "stress")
+
+
+def fibre_warnings(section: ShellMaterialSection, mesh: Mesh, parameters: Sequence[Parameter]) -> list[str]:
+    """A sentence if another direction takes the place of the fibres' on a part of the shell alone."""
+    if section.young is not None:
+        return []
+    defaults = np.array([parameter.default for parameter in parameters])
+    material = section.make(lambda value, quantity: read_affine(value, quantity, parameters)(defaults))
+    turned = ngs.IfPos(material.outside(ngs.specialcf.normal(3)), 0.0, 1.0)
+    # The space curves the cells, and lets them be curved as long as it lives.
+    space, surface = DisplacementSpace(SurfaceMesh(mesh), 2), ngs.ds(bonus_intorder=FINE)
+    area, turned = (ngs.Integrate(part * surface, space.geometry.ngs) for part in (ngs.CF(1.0), turned))
+    if not 0.0 < turned < (1.0 - 1e-9) * area:
+        return []
+    return [
+        f"the direction fibre = {list(section.fibre)} is within 6 degrees of the normal on {100.0 * turned / area:.2g} "
+        f"% of the shell: the fibres run along {'xyz'[material.next_axis]} there and turn abruptly at the edge of that "
+        "part; give a direction that is along the surface everywhere"
+    ]
 
 
 class _ClampedSupport(Section):

@@ -21,6 +21,7 @@ from morph_dslam.studies.body_study import (
     reader_of,
     with_named_sets,
 )
+from morph_dslam.studies.load_sizes import shell_load_doubt
 from morph_dslam.studies.moving_loads import check_reach, check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
@@ -33,6 +34,7 @@ from morph_dslam.studies.shell_sections import (
     ShellSupportSection,
     SurfaceSection,
     check_symmetry,
+    fibre_warnings,
     shell_mesh,
     thickness_warnings,
 )
@@ -134,11 +136,16 @@ class ShellStudy(BodyStudy, Section):
         """What the sweep solves with."""
         return loadable(ShellSweep(self.problem()), self.unknown_loads)
 
+    @property
+    def advice(self) -> str:
+        """See `BodyStudy`; before it, loads that are too large for the shell by far."""
+        return shell_load_doubt(self.problem()) + super().advice
+
     def doubts(self) -> list[str]:
-        """See `BodyStudy`: a thickness that is none of a shell, loads that fall beside it."""
+        """See `BodyStudy`: a thickness that is none of a shell, fibres that turn abruptly, loads beside it."""
         mesh, parameters = self.shell_mesh(), self.model_parameters()
-        thick = thickness_warnings(self.shell, mesh, parameters)
-        return thick + landing_warnings(self.loads, mesh, parameters)
+        found = thickness_warnings(self.shell, mesh, parameters) + fibre_warnings(self.material, mesh, parameters)
+        return found + landing_warnings(self.loads, mesh, parameters)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its cells cut into triangles, and the area of each node."""

@@ -231,6 +231,8 @@ class SolidStudy(BodyStudy, Section):
         content["parameters"] = list(self.parameters)
         content["root"] = self.root().tolist() if self.time else None
         content["time"] = self.time.model_dump(exclude_none=True) if self.time else None
+        # Earlier versions kept solutions that remembered the defaults of Prony series and of rests.
+        content |= {"memory": "of its own parameters"} if self.time else {}
         mesh = self.solid_mesh()
         content["mesh"] = mesh_fingerprint(self._solved(mesh))
         content["code"] = SOLVER_VERSION

@@ -137,15 +137,19 @@ def response_reactions(
 
 
 def follow(
-    problem: SolidProblem, start: State, target: Array, farthest: Callable[[State, Array], Array] | None = None
+    problem: SolidProblem,
+    start: State,
+    target: Array,
+    farthest: Callable[[State, Array], Array] | None = None,
+    remember: bool = True,
 ) -> State:
-    """Solve at ``target``, (d,) or (k, d) in turn, in increments from ``start``.
+    """Solve at ``target``, (d,) or (k, d) in turn, in increments from ``start``; ``remember`` as `advance` has it.
 
     Raises SolverError, which names the last parameters that converged; where not even the first increment did, those
     (d,) that ``farthest`` finds on the way from the start to a target (d,).
     """
     try:
-        return advance(problem, start, target)[-1]
+        return advance(problem, start, target, remember=remember)[-1]
     except PathError as error:
         mu = error.states[-1].mu
         if farthest is not None and len(error.states) == 1 and error.passage is None:
@@ -314,6 +318,24 @@ def loadable(sweep: Loadable, section: UnknownLoadsSection | None) -> Loadable:
     return sweep
 
 
+def _forget(problem: SolidProblem, time: float) -> None:
+    """Let viscous materials remember a body that has rested for ever, at this time (s)."""
+    assert problem.history is not None
+    memory = np.zeros_like(problem.history.values())
+    memory[-1] = time
+    problem.history.restore(memory)
+
+
+def _moved_at_once(problem: SolidProblem, start: State, mu: Array) -> State:
+    """The state that loading in an instant leads to at ``mu`` (d,), found from ``start`` and remembered.
+
+    Nothing is remembered of the way: a Prony series that changes along it would leave stress that no loading does.
+    """
+    state = start if np.array_equal(start.mu, mu) else follow(problem, start, mu, remember=False)
+    problem.advance_history(state.dofs, mu)
+    return state
+
+
 @dataclass(frozen=True)
 class _ViscousSolution:
     """A solution and what the materials remember.
@@ -333,9 +355,10 @@ class _ViscousSolution:
 class ViscousSweep:
     """Solves a viscoelastic solid (`morph_dslam.studies.problem.SweepProblem`).
 
-    All parameters but the time keep their values from the beginning on: the body is loaded in an instant, and
-    then time runs. What it remembers depends on the whole path, so derivatives by the parameters at a fixed
-    memory would be wrong ones; snapshots carry none, and the functions of the parameters are fitted to values.
+    All parameters but the time keep their values from the beginning on, that of a rest too: the body is loaded in an
+    instant, and then time runs. The way from one such instant to that of other parameters leaves no memory. What is
+    remembered depends on the whole path, so derivatives by the parameters at a fixed memory would be wrong ones;
+    snapshots carry none, and the functions of the parameters are fitted to values.
 
     Parameters
     ----------
@@ -348,37 +371,54 @@ class ViscousSweep:
     def __init__(self, problem: SolidProblem, clock: int, step: float, rest: float = 0.0) -> None:
         self.problem, self._clock, self._step, self._rest = problem, clock, step, rest
 
+    @cached_property
+    def _first(self) -> SolidProblem | None:
+        """What is applied first, where it rests."""
+        return self.problem.applied_first() if self.problem.applied_first is not None and self._rest else None
+
     def _rested(self, mu: Array) -> Array | None:
         """Dofs (n,) of what is applied first, after its rest, whose memory the problem takes; None without a rest."""
-        if self.problem.applied_first is None or not self._rest:
+        first, history = self._first, self.problem.history
+        if first is None:
             return None
-        first, history = self.problem.applied_first(), self.problem.history
         assert history is not None
         assert first.history is not None
         # Increments grow with the age of the load, as relaxation slows down.
         count = int(np.ceil(np.log1p((GROWTH - 1.0) * self._rest / self._step) / np.log(GROWTH)))
         ages = self._rest * (GROWTH ** np.arange(count + 1) - 1.0) / (GROWTH**count - 1.0)
         moments = [self._at_time(mu, mu[self._clock] - self._rest + age) for age in ages]
-        memory = history.values()
-        memory[-1] = moments[0][self._clock]
-        first.history.restore(memory)
-        state = loaded_state(first, moments[0])
-        first.advance_history(state.dofs, state.mu)
+        begin = self._at_time(self.problem.symbols.default, moments[0][self._clock])
+        _forget(first, begin[self._clock])
+        state = _moved_at_once(first, loaded_state(first, begin), moments[0])
         state = follow(first, state, np.array(moments[1:]))
         history.restore(first.history.values())
         return state.dofs
 
     @cached_property
-    def _loaded(self) -> _ViscousSolution:
-        """The default state, an instant after loading."""
-        mu = self.problem.symbols.default
-        state = loaded_state(self.problem, mu, self._rested(mu))
-        self.problem.advance_history(state.dofs, mu)
-        return self._with_memory(state)
+    def _loaded(self) -> State:
+        """The default state, an instant after loading; what rests has not rested."""
+        _forget(self.problem, self.problem.symbols.default[self._clock])
+        return loaded_state(self.problem, self.problem.symbols.default)
+
+    def _loaded_at(self, mu: Array) -> _ViscousSolution:
+        """The state at ``mu`` (d,) an instant after loading, whose memory is that of these parameters alone."""
+        rested = self._rested(mu)
+        if rested is None:
+            start = self._loaded
+            _forget(self.problem, mu[self._clock])
+            state = _moved_at_once(self.problem, start, mu)
+        else:
+            state = loaded_state(self.problem, mu, rested)
+            self.problem.advance_history(state.dofs, mu)
+        return self._with_memory(State(mu, state.dofs))
+
+    @cached_property
+    def _default_state(self) -> _ViscousSolution:
+        return self._loaded_at(self.problem.symbols.default)
 
     def first_state(self) -> _ViscousSolution:
         """The response to the default loads an instant after they came."""
-        return self._loaded
+        return self._default_state
 
     def _with_memory(self, state: State) -> _ViscousSolution:
         assert self.problem.history is not None
@@ -395,13 +435,10 @@ class ViscousSweep:
         assert self.problem.history is not None
         same_path = np.array_equal(np.delete(start.mu, self._clock), np.delete(target, self._clock))
         if not same_path or start.mu[self._clock] > target[self._clock]:
-            start = self._loaded
+            start = self._loaded_at(self._at_time(target, self.problem.symbols.default[self._clock]))
         self.problem.history.restore(start.memory)
         state = State(start.mu, start.dofs)
         begin, end = start.mu[self._clock], target[self._clock]
-        at_once = self._at_time(target, begin)
-        if not np.array_equal(at_once, start.mu):
-            state = follow(self.problem, state, at_once)
         count = int(np.ceil((end - begin) / self._step - 1e-9))
         if count:
             moments = [self._at_time(target, time) for time in np.linspace(begin, end, count + 1)[1:]]

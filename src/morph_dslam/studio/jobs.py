@@ -106,7 +106,7 @@ class Jobs:
         self.job = Job(kind, shlex.join(["morph", *words]))
         self._start = time.monotonic()
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "morph_dslam.cli", *words,
+            sys.executable, "-m", "morph_dslam", *words,
             cwd=self._folder, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, start_new_session=True,
         )  # fmt: skip

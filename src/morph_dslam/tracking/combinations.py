@@ -174,7 +174,9 @@ def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:
         raise TrackingError(
             f"the objects are anchored in different maps, {' and '.join(maps)}: register them all in one"
         )
-    if run.live and run.drawing.show is None and len({shown_field(part.model, None) for part in objects}) > 1:
+    # A rigid object is drawn grey.
+    shown = {shown_field(part.model, None) for part in objects if part.model.parameters}
+    if run.live and run.drawing.show is None and len(shown) > 1:
         raise TrackingError("the models hold different fields to colour the objects by: --show displacement")
 
 

@@ -335,7 +335,8 @@ def _draw_edges(image: NDArray[np.uint8], edges: MeshEdges, pose: RigidTransform
 def with_caption(image: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
     """A frame (h, w, 3) without the object, and why."""
     result = image.copy()
-    patch = text_patch(caption, 0.42 * max(image.shape[0] / 480.0, 0.6))[:, : image.shape[1]]
+    patch = text_patch(caption, 0.42 * max(image.shape[0] / 480.0, 0.6), image.shape[1])
+    patch = patch[-image.shape[0] :, : image.shape[1]]
     result[-patch.shape[0] :, : patch.shape[1]] = patch
     return result
 

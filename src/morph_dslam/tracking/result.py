@@ -15,7 +15,7 @@ from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import Estimate
-from morph_dslam.tracking.observability import displacement_std, von_mises_std
+from morph_dslam.tracking.observability import displacement_std, position_std, von_mises_std
 from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Status, TrackingWarning, reason_text
 from morph_dslam.tracking.reactions import Reaction, Reactions
 from morph_dslam.tracking.row_motion import RowMotion
@@ -194,6 +194,13 @@ class FrameResult:
         """Of every node (n, 3) in the camera frame, metres."""
         pose = self._tracked.state.camera_from_object
         return pose.apply(self.model.nodes + self.displacement())
+
+    def position_std(self) -> Array:
+        """Standard deviation (n,) of every node's position in the camera frame, metres: of shape and pose together.
+
+        Both are the root of the mean square distance over all directions.
+        """
+        return position_std(self.model, self._tracked)
 
     def von_mises(self, place: str | None = None) -> Array:
         """Von Mises stress (n,) of every node, pascals.

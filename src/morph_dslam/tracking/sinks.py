@@ -111,7 +111,8 @@ class LivePicture:
 
     def __init__(self, camera: Camera, views: Mapping[str, AugmentedView]) -> None:
         compile_drawing()
-        ranges = np.array([view.range_of_box() for view in views.values()])
+        coloured = [view for view in views.values() if view.label] or list(views.values())
+        ranges = np.array([view.range_of_box() for view in coloured])
         self._views, self._limits = dict(views), (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
         self._maps = camera.undistortion_maps()
 

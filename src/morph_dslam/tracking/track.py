@@ -428,6 +428,8 @@ def _shown_of(part: PlacedObject, run: TrackOptions) -> Shown | None:
 def _view_of(part: PlacedObject, run: TrackOptions) -> AugmentedView:
     """Draws an object."""
     drawing = replace(run.drawing, show=_shown_of(part, run))
+    if not part.model.parameters and len(run.objects) > 1:
+        drawing = replace(drawing, forces=False)  # those of the others
     return AugmentedView(part.model, part.camera, drawing, part.inner)
 
 

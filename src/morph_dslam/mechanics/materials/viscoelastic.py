@@ -44,8 +44,8 @@ class Prony:
 
     @property
     def bulk_relaxes(self) -> bool:
-        """Whether the volumetric part relaxes; mixed elements need one that does not."""
-        return any(evaluate(k) != 0.0 for k in self.bulk)
+        """Whether the volumetric part may relax; mixed elements need one that does not, whatever the parameters."""
+        return any(not isinstance(k, int | float) or k != 0.0 for k in self.bulk)
 
     def decays(self, time_step: Any) -> list[Any]:
         """e_i = exp(-dt / (2 tau_i))."""

@@ -138,7 +138,9 @@ class _Extrapolation:
         return weights @ np.array(self._solutions[-degree - 1 :])
 
 
-def advance(equations: Equations, start: State, target: Array, tolerance: float = TOLERANCE) -> list[State]:
+def advance(
+    equations: Equations, start: State, target: Array, tolerance: float = TOLERANCE, remember: bool = True
+) -> list[State]:
     """Solve at ``target``, along straight lines, in increments as large as converge.
 
     Equations with moving obstacles have a method ``strides`` of two parameter points: in how many parts of the line
@@ -153,12 +155,13 @@ def advance(equations: Equations, start: State, target: Array, tolerance: float 
     target : (d,) parameters, or (k, d) ones to solve at in turn; best so that they are smooth in their number, for
         solutions are extrapolated over it.
     tolerance : of Newton's method.
+    remember : whether equations with a history advance it by each solution; not where the way is no part of it.
 
     Returns
     -------
     The states along the way, ``start`` first: those at ``target``, and between them where increments were needed.
     """
-    path = _Path(equations, start, tolerance)
+    path = _Path(equations, start, tolerance, remember)
     try:
         for number, goal in enumerate(np.atleast_2d(np.asarray(target, dtype=float))):
             path.lead_to(goal, number)
@@ -178,8 +181,8 @@ class _Path:
     states : solved so far, the start first.
     """
 
-    def __init__(self, equations: Equations, start: State, tolerance: float) -> None:
-        self._equations, self._tolerance, self.states = equations, tolerance, [start]
+    def __init__(self, equations: Equations, start: State, tolerance: float, remember: bool) -> None:
+        self._equations, self._tolerance, self._remember, self.states = equations, tolerance, remember, [start]
         self._expected = _Extrapolation(equations, start.dofs)
 
     def lead_to(self, goal: Array, number: int) -> None:
@@ -194,7 +197,7 @@ class _Path:
 
     def _step(self, mu: Array, place: float) -> State:
         state = self._solve(mu, self._expected.at(place))
-        if isinstance(self._equations, _History):
+        if self._remember and isinstance(self._equations, _History):
             self._equations.advance_history(state.dofs, state.mu)
         self.states.append(state)
         self._expected.add(place, state.dofs)

@@ -1,4 +1,4 @@
-"""`python -m morph_dslam.cli`."""
+"""`python -m morph_dslam`: the command `morph`."""
 
 import sys
 
