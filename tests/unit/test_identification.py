@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -125,18 +126,45 @@ def test_forces_outside_of_the_models_range_are_left_out() -> None:
         MeasuredForces(model, ForceCurve("a", 2.0 + places, measured), reaction)
 
 
+def stating(certificate: dict[str, Any]) -> ReducedModel:
+    return replace(plate(), certificate=certificate)
+
+
 def test_what_a_result_rests_on_is_said() -> None:
-    """Which defaults were assumed, and the part of the model's error that intervals lack."""
-    error = {"errors": {"reaction_force_edge": {"relative_l2": 0.03}}}
-    model, places = replace(plate(), certificate={"discretisation": error}), np.linspace(0.0, 1.0, 9)
+    """Which defaults were assumed, and whether intervals contain the error of the mesh."""
+    stated = {
+        "reaction_force_edge": {"relative_l2": 0.01},
+        "discretisation": {"errors": {"reaction_force_edge": {"relative_l2": 0.03}}},
+    }
+    model, places = stating(stated), np.linspace(0.0, 1.0, 9)
     forces = MeasuredForces(model, ForceCurve("a", places, 70.0 * places), reaction_in_direction(model, "edge:z"))
-    text = "\n".join(identification_lines(summarise(identify(model, [forces], moduli=True))))
+    found = identify(model, [forces], moduli=True)
+    # Both errors are factors of the force, as the one to identify.
+    assert found[FACTOR].model_std == pytest.approx(0.7 * 0.04, rel=1e-6)
+    assert found[FACTOR].std == pytest.approx(0.7 * 0.04, rel=1e-6)
+    assert found[FACTOR].interval == pytest.approx((0.7 * np.exp(-1.96 * 0.04), 0.7 * np.exp(1.96 * 0.04)), rel=1e-4)
+    text = "\n".join(identification_lines(summarise(found)))
     assert f"defaults for force: b = 0.5, c = 0.5; {FACTOR} multiplies the moduli there" in text
-    assert "discretisation error: 3 % of the force on 'edge'" in text
+    assert f"most of the interval of {FACTOR} is the model's own error" in text
+    assert "do not contain the error of the model's mesh" not in text
     table = points_at([0.3] * 4, 1e-3, {"b": np.full(16, 0.2)})
     text = "\n".join(identification_lines(summarise(identify(table.model, [table], ["a"]))))
     assert "defaults for points: c = 0.5" in text
-    assert "discretisation" not in text
+    assert "do not contain the error of the model's mesh for points" in text
+
+
+def test_an_error_of_the_shape_is_one_of_the_parameters_that_are_not_known() -> None:
+    """At 0.5 m of displacement the mesh errs as a and b together; b is known, and where points see it a makes it good.
+
+    The displacement is (0.3, 0.25) m where a = 0.3 and c = 0.5, where b moves nothing.
+    """
+    errors = {"a": [0.02], "b": [0.1], "c": [0.0]}
+    entry = {"errors": errors, "displacement_rms_mm": [500.0], "left_rms_mm": [0.0]}
+    model = stating({"discretisation": {"parameters": entry}})
+    table = replace(points_at([0.3] * 4, 1e-4, {"b": np.full(16, 0.5)}), model=model)
+    found = identify(model, [table], ["a"])
+    assert found["a"].model_std == pytest.approx(0.02 * np.hypot(0.3, 0.25) / 0.5, rel=1e-3)
+    assert found["a"].std == pytest.approx(found["a"].model_std, rel=1e-2)
 
 
 def test_forces_by_frame_name_the_loading_rate() -> None:
@@ -196,6 +224,25 @@ def test_what_pictures_have_told_counts_with_its_deviation() -> None:
     std = float(np.std(table.measured[:, 0] - table.places[:, 0])) / np.sqrt(48.0)
     both = identify(table.model, [table], ["a"], prior={"a": (alone + 2.0 * std, std)})["a"].value
     assert both == pytest.approx(alone + std, abs=0.05 * std)
+
+
+def test_known_deviations_stay_without_measurements() -> None:
+    known = {"a": (0.3, 0.05), "b": (0.6, 0.1)}
+    found = identify(plate(), [], ["a", "b"], prior=known)
+    for name, (value, std) in known.items():
+        assert found[name].value == pytest.approx(value, abs=1e-6)
+        assert found[name].std == pytest.approx(std, rel=1e-4)
+        assert found[name].interval == pytest.approx((value - 1.95996 * std, value + 1.95996 * std), abs=1e-5)
+    assert found.correlation == pytest.approx(np.eye(2), abs=1e-6)
+    assert not any(line.startswith("note") for line in identification_lines(summarise(found)))
+
+
+def test_a_known_deviation_stays_where_measurements_tell_nothing() -> None:
+    """The points tell the shift alone."""
+    table = points_at([0.3] * 6, 1e-3)
+    found = identify(table.model, [table], ["a", "b"], prior={"b": (0.6, 0.05)})
+    assert found["b"].std == pytest.approx(0.05, rel=1e-3)
+    assert found["a"].std < 1e-3
 
 
 def test_a_point_beside_the_surface_is_carried_as_a_rigid_body() -> None:
@@ -324,15 +371,16 @@ def test_a_given_sign_holds_where_that_of_the_force_depends_on_what_is_identifie
 STROKES = np.linspace(0.1, 0.9, 9)
 
 
-def write_run_of_plate(folder: Path) -> None:
-    """A run that found the shift of each frame, and that b is 0.5 in all of them."""
+def write_run_of_plate(folder: Path, constants: dict[str, float] | None = None) -> None:
+    """A run that found the shift of each frame, and that b is 0.5 in all of them, say, known to 0.01."""
     write_run(folder, frames=np.arange(9))
     save_model(folder / "model.morph", plate())
     with h5py.File(folder / "result.h5", "r+") as file:
         del file["parameters"]
         file["parameters"] = np.column_stack([STROKES, np.full(9, 0.5), np.full(9, 0.5)])
-    found = {"name": "b", "value": 0.5, "standard_deviation": 0.01, "observable": True}
-    (folder / "summary.json").write_text(json.dumps({"one_over_the_sequence": [found]}))
+    values = {"b": 0.5} if constants is None else constants
+    found = [{"name": n, "value": v, "standard_deviation": 0.01, "observable": True} for n, v in values.items()]
+    (folder / "summary.json").write_text(json.dumps({"one_over_the_sequence": found}))
 
 
 @pytest.mark.parametrize(
@@ -353,6 +401,42 @@ def test_a_run_that_changes_nothing_is_said(
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("note: --run changes nothing here") for line in lines) is not used
     assert lines[-1].startswith(f"{FACTOR}=0.7 std=" if len(asked) == 1 else "b=0.5 std=")
+
+
+def values_by(folder: Path, *more: str) -> list[dict[str, Any]]:
+    """What the command finds of b and c with the run in a folder."""
+    command = ["identify", str(folder / "run" / "model.morph"), "--parameter", "b", "--parameter", "c"]
+    assert cli.main([*command, *more, "--run", str(folder / "run"), "-o", str(folder / "out")]) == 0
+    return json.loads((folder / "out" / "identification.json").read_text())["parameters"]
+
+
+def test_a_run_alone_gives_its_own_values(tmp_path: Path) -> None:
+    write_run_of_plate(tmp_path / "run", {"b": 0.5, "c": 0.7})
+    b, c = values_by(tmp_path)
+    assert (b["value"], c["value"]) == pytest.approx((0.5, 0.7), abs=1e-6)
+    assert (b["standard_deviation"], c["standard_deviation"]) == pytest.approx((0.01, 0.01), rel=1e-3)
+
+
+def test_the_unknown_correlation_of_a_runs_values_narrows_nothing(tmp_path: Path) -> None:
+    """Forces tell nothing of b and c: with the least favourable correlation 0.01 each is as sqrt(2) 0.01."""
+    write_run_of_plate(tmp_path / "run", {"b": 0.5, "c": 0.7})
+    (tmp_path / "curve.csv").write_text("a_1,force_N\n" + "".join(f"{a},{100 * a + a % 0.2}\n" for a in STROKES))
+    b, c = values_by(tmp_path, "--force", str(tmp_path / "curve.csv"), "--reaction", "edge:z")
+    assert (b["standard_deviation"], c["standard_deviation"]) == pytest.approx((0.0141421, 0.0141421), rel=1e-3)
+
+
+def test_a_run_that_ended_at_an_end_of_a_range_does_not_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_run_of_plate(tmp_path / "run", {"b": 1.0, "c": 0.7})
+    model, run = str(tmp_path / "run" / "model.morph"), str(tmp_path / "run")
+    command = ["identify", model, "--parameter", "c", "--run", run, "-o", str(tmp_path / "out")]
+    assert cli.main(command) == 2
+    assert "the run found b at the end of its range, 1, where its deviations do not hold" in capsys.readouterr().err
+    rows = "".join(f"{i},1,{0.5 * i},0,0,,{lift_of(1.0, 0.6)},\n" for i in range(3))
+    (tmp_path / "points.csv").write_text("state,b_1,place_x_m,place_y_m,place_z_m,x_m,y_m,z_m\n" + rows)
+    assert cli.main([*command, "--points", str(tmp_path / "points.csv")]) == 0
+    assert "note: what the run found for its whole sequence does not count: b at the end" in capsys.readouterr().out
 
 
 def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,8 @@ from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_repeat
 from morph_dslam.errors import IdentificationError
 
 if TYPE_CHECKING:
-    from morph_dslam import ReducedModel
+    from morph_dslam import ReducedModel, Run
+    from morph_dslam.extend.identification import MeasuredForces
 
 HELP = "find moduli and other constant parameters from measured points and forces"
 KEPT = "nothing was written"
@@ -32,6 +33,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_repeated(
         command, "--reaction", "the support of each --force, and x, +x, -x, y ... of the object frame", "SET:AXIS"
     )
+    add_flag(command, "--no-offset", "the zero of the load cell is right: no offset is added to the model's forces")
+    add_flag(command, "--align-points", "points were measured in another frame: one rigid motion of them is unknown")
     command.add_argument(
         "--run",
         dest="run_folder",
@@ -46,31 +49,31 @@ def run(arguments: argparse.Namespace) -> None:
     """Identify and print the estimates."""
     from morph_dslam import load_model, load_run
     from morph_dslam.extend.identification import (
-        MeasuredForces,
         identification_lines,
         identify,
         last_line,
         load_points,
+        values_of_run,
         write_identification,
     )
-    from morph_dslam.extend.reports import load_curve, reaction_in_direction
 
     if len(arguments.reaction) != len(arguments.force):
         raise IdentificationError("give one --reaction SET:AXIS for each --force, in the same order")
     model = load_model(arguments.model)
-    tracked = None if arguments.run_folder is None else load_run(arguments.run_folder)
-    points = [load_points(path, model) for path in arguments.points]
-    forces = [
-        MeasuredForces(model, load_curve(path, model, column), reaction_in_direction(model, text), tracked)
-        for (path, column), text in zip(arguments.force, arguments.reaction, strict=True)
-    ]
-    prior = {} if arguments.run_folder is None else _from_pictures(arguments.run_folder, model)
+    folder: Path | None = arguments.run_folder
+    tracked = None if folder is None else load_run(folder)
+    _check_once([(path.resolve(),) for path in arguments.points])
+    points = [load_points(path, model, arguments.align_points) for path in arguments.points]
+    forces = _forces(arguments, model, tracked)
+    prior, notes = dict[str, tuple[float, float]](), list[str]()
+    if folder is not None and tracked is not None:
+        prior, notes = values_of_run(folder, tracked, arguments.parameter, bool(points or forces))
     found = identify(model, [*points, *forces], arguments.parameter, arguments.moduli, prior)
     figures = write_identification(arguments.output, found)
-    for line in identification_lines(figures):
+    for line in [*identification_lines(figures), *notes]:
         print(line)
     by_frame = any(each.curve.against == "frame" for each in forces)
-    if tracked is not None and not by_frame and not set(prior) & set(arguments.parameter):
+    if tracked is not None and not (by_frame or prior or notes):
         print(
             "note: --run changes nothing here: no forces are given by frame, and no parameter to identify is one that "
             "the run found for its whole sequence"
@@ -79,12 +82,21 @@ def run(arguments: argparse.Namespace) -> None:
     print(last_line(figures))
 
 
-def _from_pictures(folder: Path, model: ReducedModel) -> dict[str, tuple[float, float]]:
-    """Value and standard deviation, SI, of the per-sequence parameters of a run."""
-    known = json.loads((folder / "summary.json").read_text())["one_over_the_sequence"]
-    units = {parameter.name: parameter.display(1.0) for parameter in model.parameters}
-    return {
-        each["name"]: (each["value"] / units[each["name"]], each["standard_deviation"] / units[each["name"]])
-        for each in known
-        if each["name"] in units and each["observable"]
-    }
+def _forces(arguments: argparse.Namespace, model: ReducedModel, tracked: Run | None) -> list[MeasuredForces]:
+    from morph_dslam.extend.identification import FEWEST_FORCES, MeasuredForces
+    from morph_dslam.extend.reports import load_curve, reaction_in_direction
+
+    curves = [load_curve(path, model, column, FEWEST_FORCES) for path, column in arguments.force]
+    files = [path.resolve() for path, _ in arguments.force]
+    _check_once([(path, curve.name) for path, curve in zip(files, curves, strict=True)])
+    return [
+        MeasuredForces(model, curve, reaction_in_direction(model, text), tracked, not arguments.no_offset)
+        for curve, text in zip(curves, arguments.reaction, strict=True)
+    ]
+
+
+def _check_once(tables: Sequence[tuple[object, ...]]) -> None:
+    """Refuse the same measurements twice: they would count as independent ones."""
+    for i, table in enumerate(tables):
+        if table in tables[:i]:
+            raise IdentificationError(f"{':'.join(map(str, table))} is given twice: its values would count twice")

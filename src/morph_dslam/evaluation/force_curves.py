@@ -45,15 +45,17 @@ class ForceCurve:
     places : (k,) frame numbers, or values of the parameter, SI.
     forces : (k,) newtons.
     name : of the forces, for plots.
+    empty : lines of the file that have no force.
     """
 
     against: str
     places: Array
     forces: Array
     name: str = "force"
+    empty: int = 0
 
 
-def load_curve(path: str | Path, model: ReducedModel, column: str | None = None) -> ForceCurve:
+def load_curve(path: str | Path, model: ReducedModel, column: str | None = None, least: int = LEAST) -> ForceCurve:
     """Read a curve: CSV whose first column is ``frame``, or a parameter with its unit, ``stroke_mm`` or
     ``stroke [mm]`` say.
 
@@ -64,11 +66,13 @@ def load_curve(path: str | Path, model: ReducedModel, column: str | None = None)
     path : the file. Lines without a force are left out.
     model : whose parameters the first column may name.
     column : which column of forces; needed where there are several.
+    least : so many forces are needed.
 
     Raises
     ------
     EvaluationError
-        If the file is missing, a column is not known, its unit is none of force, or a value is no number.
+        If the file is missing, a column is not known, its unit is none of force, a value is no number, or there are too
+        few.
     """
     (_, titles), *rows = _table(path)
     against, scale = _place(path, titles[0], model)
@@ -80,10 +84,11 @@ def load_curve(path: str | Path, model: ReducedModel, column: str | None = None)
                 f"{path}, line {line}: {len(cells)} cells under {len(titles)} titles; write decimals with points"
             )
     values = np.array([_numbers(f"{path}, line {line}", cells, at) for line, cells in rows]).reshape(-1, 2)
-    values = values[np.isfinite(values).all(axis=1)]
-    if len(values) < LEAST:
-        raise EvaluationError(f"{path} has {len(values)} forces in column '{column}': give at least {LEAST}")
-    return ForceCurve(against, scale * values[:, 0], newtons * values[:, 1], column)
+    full = np.isfinite(values).all(axis=1)
+    values = values[full]
+    if len(values) < least:
+        raise EvaluationError(f"{path} has {len(values)} forces in column '{column}': give at least {least}")
+    return ForceCurve(against, scale * values[:, 0], newtons * values[:, 1], column, int((~full).sum()))
 
 
 def _table(path: str | Path) -> list[tuple[int, list[str]]]:

@@ -7,6 +7,7 @@ from morph_dslam.identification.identify import (
     identify as identify,
 )
 from morph_dslam.identification.measurements import (
+    FEWEST_FORCES as FEWEST_FORCES,
     MeasuredForces as MeasuredForces,
     MeasuredPoints as MeasuredPoints,
     Measurement as Measurement,
@@ -17,3 +18,4 @@ from morph_dslam.identification.report import (
     last_line as last_line,
     write_identification as write_identification,
 )
+from morph_dslam.identification.run_values import values_of_run as values_of_run

@@ -2,8 +2,9 @@
 
 Weighted least squares over all measurements, each in units of what it misses in the end. Standard deviations allow for
 errors that belong together, as those of one state: the covariance is A^-1 B A^-1 with A = J'J and B the sum of
-(J_g' r_g)(J_g' r_g)' over groups g (Liang and Zeger 1986), and not less than that of independent errors. Intervals are
-Student's with as many degrees of freedom as there are groups less unknowns.
+(J_g' r_g)(J_g' r_g)' over groups g (Liang and Zeger 1986), and not less than that of independent errors. To it come
+what was known before, with its own deviation, and the model's errors e, by A^-1 J'e. Intervals are Student's, with as
+many degrees of freedom as there are groups less unknowns, for what scatters, and normal for the rest.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import qmc, t
+from scipy.stats import norm, qmc, t
 
 from morph_dslam.errors import IdentificationError
+from morph_dslam.identification.doubts import check_size, root_mean_square
 from morph_dslam.identification.measurements import MeasuredForces, Measurement
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
@@ -41,17 +43,24 @@ class Estimate:
     parameter : with its range; the factor of all moduli has one too.
     value : that fits best.
     std : standard deviation.
+    model_std : the part of it by the model's own errors.
     interval : (2,), 95 %.
     at_bound : whether it is at an end of its range.
-    identified : whether the interval is narrower than the range, and the value inside of it.
+    wide : whether the interval is as wide as the range.
     """
 
     parameter: Parameter
     value: float
     std: float
+    model_std: float
     interval: tuple[float, float]
     at_bound: bool
-    identified: bool
+    wide: bool
+
+    @property
+    def identified(self) -> bool:
+        """Whether the interval is narrower than the range, and the value inside of it."""
+        return not (self.wide or self.at_bound)
 
 
 @dataclass(frozen=True)
@@ -61,15 +70,32 @@ class Misfit:
     Attributes
     ----------
     measurement : see `measurements`.
-    predicted : (n,) with the offset.
-    offset : that fits best; 0 where there is none.
-    rms : root mean square of predicted minus measured.
+    predicted : (n,) adjusted, as with the zero of the load cell.
+    adjustment : (n,) what that added.
+    slopes : (n, f) derivatives by the unknowns that are not at an end of their range.
+    model_rms : root mean square of the model's own errors of the predictions.
     """
 
     measurement: Measurement
     predicted: Array
-    offset: float
-    rms: float
+    adjustment: Array
+    slopes: Array
+    model_rms: float
+
+    @property
+    def missed(self) -> Array:
+        """Predicted minus measured (n,)."""
+        return self.predicted - self.measurement.values
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of what it is missed by."""
+        return root_mean_square(self.missed)
+
+    @property
+    def offset(self) -> float:
+        """The zero of a load cell that fits best; 0 where there is none."""
+        return float(self.adjustment.mean())
 
 
 @dataclass(frozen=True)
@@ -91,6 +117,23 @@ class Identification:
 
     def __getitem__(self, name: str) -> Estimate:
         return next(each for each in self.estimates if each.parameter.name == name)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Covariances (k, k) of estimates over their ranges: by what scatters, what was known before, and the model.
+
+    ``groups`` is the number of those whose errors count as independent.
+    """
+
+    scatter: Array
+    known: Array
+    model: Array
+    groups: int
+
+    @property
+    def covariance(self) -> Array:
+        return self.scatter + self.known + self.model
 
 
 class _Values:
@@ -126,7 +169,8 @@ def identify(
     Raises
     ------
     IdentificationError
-        If a parameter is not the model's, or nothing measured depends on one.
+        If a parameter is not the model's, nothing measured depends on one, or forces are of another size than any of
+        the model.
     EvaluationError
         If the force that fits best falls where the measured one grows: it is that in the opposite direction.
     """
@@ -139,6 +183,7 @@ def identify(
         # Only now, for the sign of a force may depend on what is identified.
         if isinstance(misfit.measurement, MeasuredForces):
             misfit.measurement.compared.check_growth(misfit.predicted, misfit.measurement.values)
+            check_size(misfit.measurement, misfit.predicted)
     return found
 
 
@@ -187,19 +232,21 @@ class _Fit:
         # An interval may be wider than numbers reach.
         return np.where(self._log, np.exp(np.where(self._log, np.clip(inner, -LARGEST, LARGEST), 0.0)), inner)
 
-    def _misfits(self, theta: Array) -> list[Misfit]:
+    def _predictions(self, theta: Array) -> list[tuple[Array, Array]]:
+        """Of each measurement, (n,) without and with what is not known of the measurement itself."""
         values = _Values(self._model, self._unknowns, self._si(theta))
-        found = []
-        for measurement in self._measurements:
-            predicted, measured = measurement.predict(values), measurement.values
-            offset = float(np.mean(measured - predicted)) if measurement.has_offset else 0.0
-            missed = predicted + offset - measured
-            found.append(Misfit(measurement, predicted + offset, offset, float(np.sqrt(np.mean(missed**2)))))
-        return found
+        raw = [measurement.predict(values) for measurement in self._measurements]
+        return [(own, each.adjusted(own)) for own, each in zip(raw, self._measurements, strict=True)]
+
+    def _missed(self, theta: Array) -> list[Array]:
+        """Predicted minus measured values (n,) of each measurement."""
+        pairs = zip(self._predictions(theta), self._measurements, strict=True)
+        return [predicted - measurement.values for (_, predicted), measurement in pairs]
 
     def _residuals(self, theta: Array) -> Array:
-        misfits, values = zip(self._misfits(theta), self._noise, strict=True), self._si(theta)
-        parts = [(m.predicted - m.measurement.values) / noise for m, noise in misfits]
+        """What was known before comes last."""
+        parts = [missed / noise for missed, noise in zip(self._missed(theta), self._noise, strict=True)]
+        values = self._si(theta)
         return np.concatenate([*parts, [(values[i] - value) / std for i, value, std in self._prior]])
 
     def best(self) -> Array:
@@ -207,12 +254,12 @@ class _Fit:
         k = len(self._unknowns)
         starts = 0.05 + 0.9 * qmc.Sobol(k, scramble=False).random(STARTS)
         middle = np.full(k, 0.5)
-        self._noise = np.array([max(float(np.std(m.values)), 1e-300) for m in self._measurements])
+        # What is predicted to rounding must not get all the weight.
+        least = [1e-6 * max(float(np.abs(m.values).max()), 1e-300) for m in self._measurements]
+        self._noise = np.maximum([float(np.std(m.values)) for m in self._measurements], least)
         found = min((self._solved(start) for start in (middle, *starts)), key=lambda each: each[0])[1]
         for _ in range(ROUNDS if len(self._measurements) > 1 else 1):
-            # What is predicted to rounding must not get all the weight.
-            least = [1e-6 * max(float(np.abs(m.values).max()), 1e-300) for m in self._measurements]
-            self._noise = np.maximum([misfit.rms for misfit in self._misfits(found)], least)
+            self._noise = np.maximum([root_mean_square(missed) for missed in self._missed(found)], least)
             found = self._solved(found)[1]
         return found
 
@@ -223,34 +270,66 @@ class _Fit:
 
     def result(self, theta: Array) -> Identification:
         """Estimates with deviations."""
-        jacobian, residuals = self._jacobian(theta), self._residuals(theta)
+        at_bound = (theta < AT_THE_END) | (theta > 1.0 - AT_THE_END)
+        theta = np.where(at_bound, np.round(theta), theta)
+        jacobian, errors = self._jacobian(theta), self._model_errors(theta)
         silent = [p.name for p, column in zip(self._unknowns, jacobian.T, strict=True) if not column.any()]
         if silent:
             raise IdentificationError(
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
             )
-        covariance, groups = self._covariance(jacobian, residuals)
-        std = np.sqrt(np.diag(covariance))
-        freedom = max(groups - len(theta), 1)
-        half = float(t.ppf(0.975, freedom)) * std
-        low, high = self._si(theta - half), self._si(theta + half)
-        at_bound = (theta < AT_THE_END) | (theta > 1.0 - AT_THE_END)
-        value = self._si(theta)
+        spread = self._spread(jacobian, self._residuals(theta), errors)
+        estimates = self._estimates(theta, spread, at_bound)
+        std = np.sqrt(np.diag(spread.covariance))
+        products = np.outer(std, std)
+        # What is fitted without any error has no deviation.
+        correlation = np.divide(spread.covariance, products, out=np.eye(len(std)), where=products > 0.0)
+        misfits = self._misfits(theta, jacobian[:, ~at_bound], errors)
+        return Identification(estimates, correlation, misfits, spread.groups)
+
+    def _estimates(self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_]) -> tuple[Estimate, ...]:
+        scatter, known, model = (np.diag(part) for part in (spread.scatter, spread.known, spread.model))
+        std = np.sqrt(scatter + known + model)
+        of_scatter = float(t.ppf(0.975, max(spread.groups - len(theta), 1)))
+        half = np.sqrt(of_scatter**2 * scatter + float(norm.ppf(0.975)) ** 2 * (known + model))
+        low, high, value = self._si(theta - half), self._si(theta + half), self._si(theta)
         # Over the factor's logarithm a deviation is a relative one.
         slope = np.where(self._log, value, 1.0) * np.diff(self._ends, axis=1)[:, 0]
-        estimates = [
+        return tuple(
             Estimate(
                 parameter,
                 float(value[i]),
                 float(slope[i] * std[i]),
+                float(slope[i] * np.sqrt(model[i])),
                 (float(low[i]), float(high[i])),
                 bool(at_bound[i]),
-                bool(std[i] < UNOBSERVABLE_SHARE and not at_bound[i]),
+                bool(std[i] >= UNOBSERVABLE_SHARE),
             )
             for i, parameter in enumerate(self._unknowns)
-        ]
-        correlation = covariance / np.outer(std, std)
-        return Identification(tuple(estimates), correlation, tuple(self._misfits(theta)), groups)
+        )
+
+    def _misfits(self, theta: Array, slopes: Array, errors: Array) -> tuple[Misfit, ...]:
+        """With ``slopes`` (n, f) of the residuals and ``errors`` (e, n) of the model, in their units."""
+        found, begin = [], 0
+        for measurement, noise, (raw, predicted) in zip(
+            self._measurements, self._noise, self._predictions(theta), strict=True
+        ):
+            rows = slice(begin, begin + len(raw))
+            size = root_mean_square(np.linalg.norm(errors[:, rows], axis=0))
+            found.append(Misfit(measurement, predicted, predicted - raw, noise * slopes[rows], noise * size))
+            begin = rows.stop
+        return tuple(found)
+
+    def _model_errors(self, theta: Array) -> Array:
+        """(e, n) of all measurements, in the units of their residuals; those of one unit have rows in common."""
+        values, tables = _Values(self._model, self._unknowns, self._si(theta)), self._measurements
+        own = [table.model_errors(values) / noise for table, noise in zip(tables, self._noise, strict=True)]
+        blocks = [np.zeros((0, sum(part.shape[1] for part in own)))]
+        for unit in dict.fromkeys(table.unit for table in tables):
+            parts = [part if table.unit == unit else part[:0] for part, table in zip(own, tables, strict=True)]
+            height = max(map(len, parts))
+            blocks.append(np.hstack([np.pad(part, ((0, height - len(part)), (0, 0))) for part in parts]))
+        return np.vstack(blocks)
 
     def _jacobian(self, theta: Array) -> Array:
         """Derivatives (n, k) by central differences within the range."""
@@ -262,19 +341,24 @@ class _Fit:
             columns.append(change / (above - below)[i])
         return np.column_stack(columns)
 
-    def _covariance(self, jacobian: Array, residuals: Array) -> tuple[Array, int]:
-        """(k, k) over the ranges, and the number of groups."""
+    def _spread(self, jacobian: Array, residuals: Array, errors: Array) -> _Spread:
+        """Of estimates over their ranges, by the ``errors`` (e, n) of the model among others."""
         n, k = jacobian.shape
-        groups = len(np.unique(self._groups))
+        measured, left = jacobian[: errors.shape[1]], residuals[: errors.shape[1]]
+        # What was known before has the deviation that it came with, even if nothing contradicts it.
+        before = jacobian[len(left) :] * np.maximum(np.abs(residuals[len(left) :]), 1.0)[:, None]
         inverse = np.linalg.pinv(jacobian.T @ jacobian)
         # Directions that the measurements do not see are as uncertain as can be.
         values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
         unseen = vectors[:, values <= 1e-12 * values.max()]
-        independent = inverse * float(residuals @ residuals) / max(n - k, 1) + unseen @ unseen.T
-        if groups <= k:
-            return independent, groups
-        scores = np.zeros((groups, k))
-        np.add.at(scores, self._groups, jacobian * residuals[:, None])
-        together = inverse @ scores.T @ scores @ inverse * groups / (groups - k)
-        wider = np.sqrt(np.maximum(np.diag(together) / np.diag(independent), 1.0))
-        return independent * np.outer(wider, wider), groups
+        scatter = inverse @ measured.T @ measured @ inverse * float(left @ left) / max(n - k, 1) + unseen @ unseen.T
+        groups = len(np.unique(self._groups))
+        if groups > k:
+            scores = np.zeros((groups, k))
+            np.add.at(scores, self._groups[: len(left)], measured * left[:, None])
+            together = inverse @ scores.T @ scores @ inverse * groups / (groups - k)
+            own = np.maximum(np.diag(scatter), np.finfo(float).tiny)
+            wider = np.sqrt(np.maximum(np.diag(together) / own, 1.0))
+            scatter = scatter * np.outer(wider, wider)
+        by_model = errors @ measured @ inverse
+        return _Spread(scatter, inverse @ before.T @ before @ inverse, by_model.T @ by_model, groups)

@@ -19,10 +19,13 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import ReactionInDirection
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.geometry import fit_similarity
+from morph_dslam.identification.model_error import shape_errors
 from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
-from morph_dslam.model.reduced_model import FORCE, REACTION
+from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.stated_errors import force_error
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.units import FACTORS
 
@@ -39,6 +42,8 @@ STRETCHES = 8
 LEAST_RATE = 1e-6
 #: Fewer forces determine no offset and anything else.
 FEWEST_FORCES = 4
+#: Repeated forces that differ by more than this share of the curve's change are not of one curve.
+MOST_REPEATED = 0.1
 
 
 class Unknowns(Protocol):
@@ -59,11 +64,6 @@ class Measurement(Protocol):
     def name(self) -> str: ...
     @property
     def model(self) -> ReducedModel: ...
-    @property
-    def field(self) -> str:
-        """The field of the model that predicts the values."""
-        ...
-
     @property
     def given(self) -> frozenset[str]:
         """Names of the parameters that it gives; those that are not identified either have their defaults."""
@@ -90,12 +90,28 @@ class Measurement(Protocol):
         ...
 
     @property
-    def has_offset(self) -> bool:
-        """Whether an unknown offset is added to the predictions, such as the zero of a load cell."""
+    def changes(self) -> Array:
+        """By how much the load changed the values (n,), SI."""
+        ...
+
+    @property
+    def mesh_error_stated(self) -> bool:
+        """Whether the model states what its mesh adds to the errors of predictions."""
         ...
 
     def predict(self, unknowns: Unknowns) -> Array:
         """(n,), SI."""
+        ...
+
+    def adjusted(self, predicted: Array) -> Array:
+        """Predictions (n,) with what is not known of the measurement itself, such as the zero of a load cell."""
+        ...
+
+    def model_errors(self, unknowns: Unknowns) -> Array:
+        """Errors (e, n) of predictions by the model itself, SI, independent of each other, of either sign.
+
+        Measurements of one unit share them.
+        """
         ...
 
 
@@ -112,6 +128,7 @@ class MeasuredPoints:
     known : (r,) values of known parameters by name, SI.
     places : (r, 3) on the undeformed object, m.
     measured : (r, 3) in the state, m; NaN where a coordinate was not measured.
+    aligned : whether one rigid motion of all points is unknown, as where they were measured in another frame.
     """
 
     model: ReducedModel
@@ -119,11 +136,14 @@ class MeasuredPoints:
     known: Mapping[str, Array]
     places: Array
     measured: Array
+    aligned: bool = False
     name = "points"
-    field = "displacement"
     unit = "mm"
     scale = 1e3
-    has_offset = False
+
+    def __post_init__(self) -> None:
+        if self.aligned and not self._present.all():
+            raise IdentificationError("points that are to be aligned need all three measured coordinates in every row")
 
     @property
     def given(self) -> frozenset[str]:
@@ -155,8 +175,32 @@ class MeasuredPoints:
             )
         return self.model.triangles[points.triangles], points.weights
 
+    @property
+    def changes(self) -> Array:
+        return (self.measured - self.places)[self._present]
+
+    @property
+    def span(self) -> float | None:
+        """Extent of the places, of the object's; None of fewer than three, which tell no unit."""
+        size = float(np.linalg.norm(np.ptp(self.model.nodes, axis=0)))
+        several = len(np.unique(self.places, axis=0)) > 2
+        return float(np.linalg.norm(np.ptp(self.places, axis=0))) / size if several else None
+
+    @property
+    def mesh_error_stated(self) -> bool:
+        return ParameterErrors.of(self.model) is not None
+
     def predict(self, unknowns: Unknowns) -> Array:
         return self.positions(unknowns.vector)[self._present]
+
+    def adjusted(self, predicted: Array) -> Array:
+        if not self.aligned:
+            return predicted
+        motion = fit_similarity(predicted.reshape(-1, 3), self.measured, with_scale=False)
+        return motion.apply(predicted.reshape(-1, 3)).ravel()
+
+    def model_errors(self, unknowns: Unknowns) -> Array:
+        return shape_errors(self.model, self.positions, unknowns.vector)[:, self._present]
 
     def positions(self, vector: Callable[[Mapping[str, float]], Array]) -> Array:
         """Where the model has the points (r, 3), m; ``vector`` makes its parameters (d,) of the known ones."""
@@ -191,7 +235,7 @@ def _frames(triangles: Array) -> Array:
     return np.stack([along, np.cross(normal, along), normal], axis=2)
 
 
-def load_points(path: str | Path, model: ReducedModel) -> MeasuredPoints:
+def load_points(path: str | Path, model: ReducedModel, aligned: bool = False) -> MeasuredPoints:
     """Read a table of points: CSV with a line of titles.
 
     Columns are ``state`` (a name), known parameters with their unit (``load_N``), where the point is on the undeformed
@@ -201,6 +245,7 @@ def load_points(path: str | Path, model: ReducedModel) -> MeasuredPoints:
     ----------
     path : the file.
     model : whose parameters may be known.
+    aligned : whether one rigid motion of all points is unknown.
 
     Raises
     ------
@@ -217,7 +262,7 @@ def load_points(path: str | Path, model: ReducedModel) -> MeasuredPoints:
         raise IdentificationError(f"{path}: no point was measured: columns {', '.join(MEASURED)} are empty")
     parameters = {parameter.name: parameter for parameter in model.parameters}
     values = {name: table.known(title, parameters[name], factor) for title, (name, factor) in known.items()}
-    return MeasuredPoints(model, tuple(table.states), values, places, measured)
+    return MeasuredPoints(model, tuple(table.states), values, places, measured, aligned)
 
 
 class _PointTable:
@@ -312,15 +357,16 @@ class MeasuredForces:
         in which it grows with the measured force, at known parameters and the defaults of all others.
     run : whose frames the curve is given by, and whose estimates are the parameters that are not identified; None for a
         curve over a parameter.
+    free_zero : whether the zero of the load cell is an unknown offset.
     """
 
     model: ReducedModel
     curve: ForceCurve
     reaction: ReactionInDirection
     run: Run | None = None
+    free_zero: bool = True
     unit = "N"
     scale = 1.0
-    has_offset = True
 
     def __post_init__(self) -> None:
         if self.curve.against == "frame" and self.run is None:
@@ -330,14 +376,23 @@ class MeasuredForces:
                 f"{len(self.values)} forces of {self.name} are left to compare, and {FEWEST_FORCES} are needed: "
                 f"the others are {self.why_left_out}"
             )
+        self._check_repeated()
+
+    def _check_repeated(self) -> None:
+        """Refuse forces that are very different in one place: one line is wrong, or they are of two branches."""
+        for place in np.unique(self.places):
+            here = self.values[self.places == place]
+            if np.ptp(here) > MOST_REPEATED * np.ptp(self.values):
+                where = f"frame {place:g}" if self._against is None else f"{self._against.name} = "
+                where += "" if self._against is None else self._against.text(float(place))
+                raise IdentificationError(
+                    f"{self.name} is {here.min():.4g} N and {here.max():.4g} N at {where}: give one branch of the "
+                    "curve, or the forces by frame (first column frame)"
+                )
 
     @property
     def name(self) -> str:
         return self.curve.name
-
-    @property
-    def field(self) -> str:
-        return f"{REACTION}{FORCE}{self.reaction.support}"
 
     @property
     def given(self) -> frozenset[str]:
@@ -392,8 +447,35 @@ class MeasuredForces:
         along = np.array([self.reaction(self.model.vector(known)) for known in self._known])
         return self.reaction.following(along, self.values)
 
+    @property
+    def changes(self) -> Array:
+        return self.values - self.values.mean() if self.free_zero else self.values
+
+    @property
+    def share_of_range(self) -> float | None:
+        """How much of the model's range of the parameter that it is given by the curve covers."""
+        own = self._against
+        return None if own is None else float(np.ptp(self.places)) / (own.upper - own.lower)
+
+    @property
+    def mesh_error_stated(self) -> bool:
+        stated = force_error(self.model, self.reaction.support)
+        return stated is not None and stated[1]
+
     def predict(self, unknowns: Unknowns) -> Array:
         return unknowns.factor * np.array([self.compared(unknowns.vector(known)) for known in self._known])
+
+    def adjusted(self, predicted: Array) -> Array:
+        return predicted + float(np.mean(self.values - predicted)) if self.free_zero else predicted
+
+    def model_errors(self, unknowns: Unknowns) -> Array:
+        stated = force_error(self.model, self.reaction.support)
+        if stated is None:
+            return np.zeros((0, len(self.values)))
+        forces = np.array([self.compared.field.value(unknowns.vector(known))[0] for known in self._known])
+        # Like a factor of all forces, and of the whole force where that along an axis is a small part.
+        sizes = np.linalg.norm(forces, axis=1) * np.sign(self.compared.sign * forces[:, self.compared.axis])
+        return unknowns.factor * stated[0] * sizes[None]
 
     @cached_property
     def _known(self) -> list[dict[str, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.evaluation.force import reaction_remark
+from morph_dslam.evaluation.force import SMALL_SHARE, reaction_remark
+from morph_dslam.identification.doubts import LEAST_PROBABILITY, likeness, root_mean_square
 from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
 from morph_dslam.io.writing import writing
@@ -38,57 +40,75 @@ def _figures(each: Estimate) -> dict[str, Any]:
     return {
         "name": parameter.name,
         "unit": parameter.unit,
+        "range": [parameter.display(parameter.lower), parameter.display(parameter.upper)],
         "value": parameter.display(each.value),
         "standard_deviation": parameter.display(each.std),
+        "standard_deviation_by_model": parameter.display(each.model_std),
         "interval_95": [parameter.display(end) for end in each.interval],
         "at_bound": each.at_bound,
+        "as_wide_as_range": each.wide,
         "identified": each.identified,
     }
 
 
 def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]:
     measurement = misfit.measurement
-    known, model = {*measurement.given, *identified}, measurement.model
-    discretisation = model.certificate.get("discretisation", {}).get("errors", {}).get(measurement.field)
+    known, scale = {*measurement.given, *identified}, measurement.scale
     figures = {
         "name": measurement.name,
         "unit": measurement.unit,
         "values": len(measurement.values),
         "groups": len(np.unique(measurement.groups)),
-        "rms": measurement.scale * misfit.rms,
-        "largest": measurement.scale * float(np.abs(misfit.predicted - measurement.values).max()),
+        "rms": scale * misfit.rms,
+        "largest": scale * float(np.abs(misfit.missed).max()),
+        "change_rms": scale * root_mean_square(measurement.changes),
+        "model_error_rms": scale * misfit.model_rms,
+        "mesh_error_stated": measurement.mesh_error_stated,
         "at_default": [
             {"name": p.name, "unit": p.unit, "value": p.display(p.default)}
-            for p in model.study_parameters
+            for p in measurement.model.study_parameters
             if p.name not in known
         ],
-        "discretisation_error": None if discretisation is None else discretisation["relative_l2"],
     }
     if isinstance(measurement, MeasuredForces):
-        units = {p.name: p for p in measurement.model.parameters}
-        rates = [(n, rate) for n, rate in measurement.loading_rates.items() if n not in identified]
-        figures |= {"support": measurement.compared.support, "direction": measurement.compared.direction}
-        figures |= {"left_out": measurement.left_out}
-        figures |= {"why": f"they are {measurement.why_left_out}"} if measurement.left_out else {}
-        figures["loading_rate_per_frame"] = {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates}
-    return figures | ({"offset": measurement.scale * misfit.offset} if measurement.has_offset else {})
+        return figures | _force_figures(misfit, measurement, identified)
+    if isinstance(measurement, MeasuredPoints):
+        figures["span_of_object"] = measurement.span
+        moved = np.sqrt(3.0) * scale * root_mean_square(misfit.adjustment)
+        return figures | ({"moved_rms": moved} if measurement.aligned else {})
+    return figures
 
 
+def _force_figures(misfit: Misfit, forces: MeasuredForces, identified: Sequence[str]) -> dict[str, Any]:
+    """Those that points do not have."""
+    units = {p.name: p for p in forces.model.parameters}
+    rates = [(n, rate) for n, rate in forces.loading_rates.items() if n not in identified]
+    order, zero = np.argsort(forces.places, kind="stable"), np.ones((len(forces.values), int(forces.free_zero)))
+    alike = likeness(misfit.missed[order], np.hstack([misfit.slopes, zero])[order])
+    figures = {
+        "support": forces.compared.support,
+        "direction": forces.compared.direction,
+        "against": forces.curve.against,
+        "share_of_range": forces.share_of_range,
+        "lines_without_force": forces.curve.empty,
+        "left_out": forces.left_out,
+        "loading_rate_per_frame": {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates},
+        "neighbours": None if alike is None else asdict(alike),
+    }
+    figures |= {"why": f"they are {forces.why_left_out}"} if forces.left_out else {}
+    return figures | ({"offset": misfit.offset} if forces.free_zero else {})
+
+
+#: Note what is missed by more than this part of what the load changed; smaller residuals than the other part of it
+#: are not looked at; points that lie within this part of the object.
+MOST_MISSED, LEAST_MISSED, LEAST_SPAN = 0.25, 1e-3, 0.05
 #: Estimates that are more correlated than this, either way, are named.
 CORRELATED = 0.95
 
 
 def identification_lines(figures: Mapping[str, Any]) -> list[str]:
     """What was identified, and what a reader must know of it."""
-    said = []
-    for each in figures["parameters"]:
-        low, high = each["interval_95"]
-        unit = "" if each["unit"] == "1" else f" {each['unit']}"
-        said.append(f"{each['name']} = {each['value']:.4g}{unit}, 95 % interval {low:.4g} to {high:.4g}{unit}")
-        if each["at_bound"]:
-            said.append(f"note: {each['name']} is at the end of its range: the model may need a wider one")
-        elif not each["identified"]:
-            said.append(f"note: {each['name']} could not be identified: its interval is as wide as its range")
+    said = [line for each in figures["parameters"] for line in _parameter_lines(each)]
     names = list(figures["correlation"])
     for i, a in enumerate(names):
         for b in names[i + 1 :]:
@@ -97,38 +117,94 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
                     f"note: {a} and {b} are correlated by {figures['correlation'][a][b]:.3f}: what was measured tells "
                     "little more than a combination of them"
                 )
-    if figures["groups"] < 3 * len(names):
+    if figures["measurements"] and figures["groups"] < 3 * len(names):
         said.append(
             f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
             "intervals are rough"
         )
-    said += [*_not_in_intervals(figures["measurements"]), *_at_default(figures["measurements"], FACTOR in names)]
-    for each in figures["measurements"]:
-        offset = f", offset {each['offset']:.3g} {each['unit']}" if "offset" in each else ""
-        said.append(f"{each['name']}: {each['values']} values missed by {each['rms']:.3g} {each['unit']} rms{offset}")
-        if "support" in each:
-            said.append(f"note: {each['name']} is compared with {reaction_remark(each)}")
-        if each.get("left_out"):
-            of = each["left_out"] + each["values"]
-            said.append(f"note: {each['left_out']} of {of} forces of {each['name']} are left out: {each['why']}")
-        rates = each.get("loading_rate_per_frame")
-        if rates is not None:
-            rate = ", ".join(f"{name} {rate:.3g} a frame" for name, rate in rates.items())
-            said.append(
-                f"loading rate: {rate or 'not known, forces are not given by frame'}; moduli may differ at others"
-            )
+    said += [*_model_errors(figures), *_at_default(figures["measurements"], FACTOR in names)]
+    return said + [line for each in figures["measurements"] for line in _measurement_lines(each)]
+
+
+def _parameter_lines(each: Mapping[str, Any]) -> list[str]:
+    (low, high), (lower, upper) = each["interval_95"], each["range"]
+    unit = "" if each["unit"] == "1" else f" {each['unit']}"
+    beyond = low <= lower and high >= upper
+    interval = "wider than its range," if beyond else f"{low:.4g} to {high:.4g}{unit}"
+    whole = f" {lower:.4g} to {upper:.4g}{unit}" if beyond else ""
+    said = [f"{each['name']} = {each['value']:.4g}{unit}, 95 % interval {interval}{whole}"]
+    if each["at_bound"]:
+        advice = "" if each["as_wide_as_range"] else ": the model may need a wider one"
+        said.append(f"note: {each['name']} is at the end of its range{advice}")
+    if each["as_wide_as_range"]:
+        said.append(f"note: {each['name']} could not be identified: its interval is as wide as its range")
     return said
 
 
-def _not_in_intervals(measurements: Sequence[Mapping[str, Any]]) -> list[str]:
-    """By how much the model errs in each measurement because its elements are no finer, if its file says so."""
-    parts = [
-        f"{100.0 * each['discretisation_error']:.2g} % of the "
-        + (f"force on '{each['support']}'" if "support" in each else "displacement")
-        for each in measurements
-        if each["discretisation_error"] is not None
-    ]
-    return [f"note: intervals do not contain the model's discretisation error: {', '.join(parts)}"] if parts else []
+def _model_errors(figures: Mapping[str, Any]) -> list[str]:
+    """Which intervals are the model's own error, and where its file does not state all of it."""
+    said, half = [], np.sqrt(0.5)
+    if by_model := [
+        each["name"]
+        for each in figures["parameters"]
+        if each["standard_deviation_by_model"] > half * each["standard_deviation"]
+    ]:
+        said.append(
+            f"note: most of the interval of {', '.join(by_model)} is the model's own error: finer elements, or more "
+            "training solutions, would narrow it"
+        )
+    if unknown := [each["name"] for each in figures["measurements"] if not each["mesh_error_stated"]]:
+        said.append(
+            f"note: intervals do not contain the error of the model's mesh for {', '.join(unknown)}: its file does not "
+            "state it"
+        )
+    return said
+
+
+def _measurement_lines(each: Mapping[str, Any]) -> list[str]:
+    name, unit = each["name"], each["unit"]
+    offset = f", offset {each['offset']:.3g} {unit}" if "offset" in each else ""
+    offset += f", moved by {each['moved_rms']:.3g} {unit} rms" if "moved_rms" in each else ""
+    said = [f"{name}: {each['values']} values missed by {each['rms']:.3g} {unit} rms{offset}", *_doubts(each)]
+    if "support" not in each:
+        return said
+    said.append(f"note: {name} is compared with {reaction_remark(each)}")
+    if each["left_out"]:
+        of = each["left_out"] + each["values"]
+        said.append(f"note: {each['left_out']} of {of} forces of {name} are left out: {each['why']}")
+    if each["lines_without_force"]:
+        said.append(f"note: {name} is empty in {each['lines_without_force']} lines of its file")
+    rate = ", ".join(f"{name} {rate:.3g} a frame" for name, rate in each["loading_rate_per_frame"].items())
+    return [*said, f"loading rate: {rate or 'not known, forces are not given by frame'}; moduli may differ at others"]
+
+
+def _doubts(each: Mapping[str, Any]) -> list[str]:
+    """What speaks against a measurement being what the model describes."""
+    said, name, unit = [], each["name"], each["unit"]
+    if each["rms"] > MOST_MISSED * each["change_rms"]:
+        check = "--reaction" if "support" in each else "that x, y, z are positions in the object frame (--align-points)"
+        said.append(
+            f"note: {name} changed by {each['change_rms']:.3g} {unit} rms, and {each['rms']:.3g} {unit} of it is "
+            f"missed: check the units, and {check}"
+        )
+    span, share = each.get("span_of_object"), each.get("share_of_range")
+    if span is not None and span < LEAST_SPAN:
+        said.append(
+            f"note: all points lie within {100.0 * span:.2g} % of the object: is the unit of their places right?"
+        )
+    if share is not None and share < SMALL_SHARE:
+        said.append(
+            f"note: {name} covers {100.0 * share:.2g} % of the model's range of {each['against']}: is the unit in the "
+            "name of its first column right?"
+        )
+    alike, least = each.get("neighbours"), max(each["model_error_rms"], LEAST_MISSED * each["change_rms"])
+    if alike and alike["probability"] < LEAST_PROBABILITY and alike["rms"] > least:
+        said.append(
+            f"note: neighbouring residuals of {name} are alike (Durbin-Watson {alike['durbin_watson']:.2g}; 2 if "
+            "independent): the law, the loading or the support differs from the model's, which intervals do not "
+            "contain; see identification.png"
+        )
+    return said
 
 
 def _at_default(measurements: Sequence[Mapping[str, Any]], scaled: bool) -> list[str]:
@@ -171,32 +247,43 @@ def write_identification(folder: Path, found: Identification) -> dict[str, Any]:
 
 
 def plot(path: Path, misfits: Sequence[Misfit]) -> None:
-    """What the model predicts beside measured forces, and what it misses measured points by."""
-    figure = Figure(figsize=(5.2 * max(len(misfits), 1), 4.4), layout="constrained")
-    for axes, misfit in zip(np.atleast_1d(figure.subplots(1, max(len(misfits), 1))), misfits, strict=False):
+    """What the model predicts beside measured forces, and what it misses forces and points by."""
+    columns = max(len(misfits), 1)
+    figure = Figure(figsize=(5.2 * columns, 5.2), layout="constrained")
+    grid = figure.add_gridspec(2, columns, height_ratios=(2.0, 1.0))
+    for column, misfit in enumerate(misfits):
         if isinstance(misfit.measurement, MeasuredForces):
-            _plot_forces(axes, misfit, misfit.measurement)
+            above = figure.add_subplot(grid[0, column])
+            below = figure.add_subplot(grid[1, column], sharex=above)
+            _plot_forces(above, below, misfit, misfit.measurement)
         elif isinstance(misfit.measurement, MeasuredPoints):
-            _plot_points(axes, misfit, misfit.measurement)
+            _plot_points(figure.add_subplot(grid[:, column]), misfit, misfit.measurement)
+    for axes in figure.axes:
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=DPI)
 
 
-def _plot_forces(axes: Axes, misfit: Misfit, forces: MeasuredForces) -> None:
+def _plot_forces(above: Axes, below: Axes, misfit: Misfit, forces: MeasuredForces) -> None:
+    """The forces, and what is missed of them."""
     parameter = next((p for p in forces.model.parameters if p.name == forces.curve.against), None)
     order = np.argsort(forces.places)
     places = forces.places[order] * (1.0 if parameter is None else parameter.display(1.0))
-    axes.plot(places, forces.values[order], "k.", markersize=4, label="measured")
-    axes.plot(places, misfit.predicted[order], color="#1f4e79", label="model and offset")
-    axes.set_xlabel("frame" if parameter is None else _label(parameter))
-    axes.set_ylabel(f"{forces.name} [N]")
-    axes.legend(fontsize=8)
+    fitted = "model and offset" if forces.free_zero else "model"
+    above.plot(places, forces.values[order], "k.", markersize=4, label="measured")
+    above.plot(places, misfit.predicted[order], color="#1f4e79", label=fitted)
+    above.set_ylabel(f"{forces.name} [N]")
+    above.tick_params(labelbottom=False)
+    above.legend(fontsize=8)
+    below.plot(places, misfit.missed[order], ".-", color="#1f4e79", markersize=4, linewidth=0.8)
+    below.axhline(0.0, color="#888888", linewidth=0.8)
+    below.set_xlabel("frame" if parameter is None else _label(parameter))
+    below.set_ylabel("predicted - measured [N]", fontsize=8)
 
 
 def _plot_points(axes: Axes, misfit: Misfit, points: MeasuredPoints) -> None:
     """What each coordinate is missed by, state by state."""
     missed = np.full(points.measured.shape, np.nan)
-    missed[np.isfinite(points.measured)] = points.scale * (misfit.predicted - points.values)
+    missed[np.isfinite(points.measured)] = points.scale * misfit.missed
     states = list(dict.fromkeys(points.states))
     at = np.array([states.index(state) for state in points.states])
     for axis, name in enumerate("xyz"):

@@ -1,0 +1,65 @@
+"""What a run of a video found for its whole sequence, as known before."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from morph_dslam.errors import IdentificationError
+from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.identification.identify import AT_THE_END
+from morph_dslam.model import Parameter
+
+
+def values_of_run(
+    folder: Path, run: Run, names: Collection[str], measured: bool
+) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    """Value and standard deviation, SI, of the parameters to identify, and notes on those that do not count.
+
+    A run keeps no correlation of them. Of k parameters each deviation is multiplied by sqrt(k): k times the diagonal
+    of a covariance is never less than the covariance, whatever the correlation.
+
+    Parameters
+    ----------
+    folder : of the run.
+    run : read from it.
+    names : of the parameters to identify.
+    measured : whether points or forces were measured too. Else the values are the run's own.
+
+    Raises
+    ------
+    IdentificationError
+        If nothing else was measured, and the run found a parameter at an end of its range.
+    """
+    found = json.loads((folder / "summary.json").read_text())["one_over_the_sequence"]
+    of_model = {parameter.name: parameter for parameter in run.model.parameters}
+    taken = [each for each in found if each["name"] in names and each["name"] in of_model and each["observable"]]
+    ends = [text for each in found if taken and (text := _at_the_end(of_model.get(each["name"]), each["value"]))]
+    if ends and not measured:
+        raise IdentificationError(
+            f"the run found {' and '.join(ends)}, where its deviations do not hold, and nothing else was measured: "
+            "build the model with a wider range, or give points or forces"
+        )
+    if ends:
+        return {}, [f"note: what the run found for its whole sequence does not count: {' and '.join(ends)}"]
+    wider, scale = float(np.sqrt(len(taken))) if measured else 1.0, {n: p.display(1.0) for n, p in of_model.items()}
+    return {
+        each["name"]: (each["value"] / scale[each["name"]], wider * each["standard_deviation"] / scale[each["name"]])
+        for each in taken
+    }, []
+
+
+def _at_the_end(parameter: Parameter | None, value: float) -> str | None:
+    """In words, that a value in the parameter's unit is at an end of its range; None if it is not."""
+    if parameter is None:
+        return None
+    low, high = parameter.display(parameter.lower), parameter.display(parameter.upper)
+    below, above = value - low, high - value
+    if min(below, above) >= AT_THE_END * (high - low):
+        return None
+    return (
+        f"{parameter.name} at the end of its range, {parameter.text([parameter.lower, parameter.upper][above < below])}"
+    )

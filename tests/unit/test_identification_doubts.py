@@ -1,0 +1,197 @@
+"""Identification from tables in other units, of other axes and frames, given twice, or of another law."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morph_dslam.cli import app as cli
+from morph_dslam.errors import IdentificationError
+from morph_dslam.evaluation.force import reaction_in_direction
+from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
+from morph_dslam.identification.doubts import likeness
+from morph_dslam.identification.identify import FACTOR, Identification, identify
+from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
+from morph_dslam.identification.report import identification_lines, summarise
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
+from morph_dslam.model.functions import ParameterFunctions
+
+#: A plate of 1 m that is stretched by a along x, by a force of 100 a + 100 b a^2 newtons along it.
+CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def stretched_plate() -> ReducedModel:
+    a, b = Parameter("a", "length", "mm", 0.0, 1.0, 0.0), Parameter("b", "ratio", "1", 0.0, 1.0, 0.0)
+    # Chebyshev polynomials of x = 2 a - 1 and y = 2 b - 1: a = (1 + x) / 2, a^2 = (3 + 4 x + T2(x)) / 8.
+    indices = np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]])
+    stretch, bent = np.array([0.5, 0.5, 0, 0, 0, 0]), np.array([3.0, 4.0, 1.0, 3.0, 4.0, 1.0]) / 16.0
+    functions = ParameterFunctions(np.zeros(2), np.ones(2), indices, np.column_stack([stretch, bent]))
+    shape, force = np.zeros((2, 4, 3)), np.zeros((2, 1, 3))
+    shape[0, :, 0], force[:, 0, 0] = CORNERS[:, 0], 100.0
+    return ReducedModel(
+        "plate",
+        CORNERS,
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        (a, b),
+        SeparatedField(shape, functions),
+        reactions={"force_edge": SeparatedField(force, functions)},
+    )
+
+
+STRETCHES = np.linspace(0.05, 0.95, 19)
+NOISE = 0.3 * np.random.default_rng(3).normal(size=19)
+
+
+def forces(measured: np.ndarray, stretches: np.ndarray = STRETCHES, free_zero: bool = True) -> MeasuredForces:
+    model = stretched_plate()
+    curve = ForceCurve("a", stretches, measured)
+    return MeasuredForces(model, curve, reaction_in_direction(model, "edge:x"), free_zero=free_zero)
+
+
+def lines(found: Identification) -> str:
+    return "\n".join(identification_lines(summarise(found)))
+
+
+def of_law(share: float) -> np.ndarray:
+    return 100.0 * STRETCHES + 100.0 * share * STRETCHES**2
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_forces_of_another_size_are_refused(factor: float) -> None:
+    table = forces(factor * (of_law(0.4) + NOISE))
+    with pytest.raises(IdentificationError, match="times what the model's force changes by"):
+        identify(table.model, [table], ["b"])
+
+
+def test_right_forces_are_not_doubted() -> None:
+    table = forces(of_law(0.4) + NOISE + 7.0)
+    found = identify(table.model, [table], ["b"])
+    low, high = found["b"].interval
+    assert low < 0.4 < high
+    text = lines(found)
+    assert not any(word in text for word in ("check the units", "alike", "is the unit"))
+
+
+def test_another_law_is_seen_from_neighbouring_residuals() -> None:
+    """Forces of a law without a quadratic part by a model with one of 100 N, whose moduli alone are free."""
+    table = forces(of_law(1.0) + NOISE)
+    found = identify(table.model, [table], moduli=True)
+    assert "neighbouring residuals of force are alike" in lines(found)
+
+
+def test_residuals_below_the_models_own_error_are_not_doubted() -> None:
+    table = forces(of_law(0.02) + 1e-3 * NOISE)
+    stated = replace(table.model, certificate={"reaction_force_edge": {"relative_l2": 0.02}})
+    found = identify(stated, [replace(table, model=stated)], moduli=True)
+    assert "alike" not in lines(found)
+
+
+def test_independent_residuals_are_alike_as_often_as_is_said() -> None:
+    """Whatever a fit of a parabola leaves of noise: one time in twenty the probability is below 0.05."""
+    random, x = np.random.default_rng(8), np.linspace(0.0, 1.0, 15)
+    found = [likeness(random.normal(size=15), np.vander(x, 3)) for _ in range(3000)]
+    below = np.mean([each is not None and each.probability < 0.05 for each in found])
+    assert below == pytest.approx(0.05, abs=0.015)
+    assert likeness(x**2, np.vander(x, 3)) is None
+    # Four differences of 2 and a sum of squares of 5, without any unknown.
+    alternating = likeness(np.array([1.0, -1.0, 1.0, -1.0, 1.0]), np.empty((5, 0)))
+    assert alternating is not None
+    assert alternating.durbin_watson == pytest.approx(16.0 / 5.0)
+
+
+def test_two_branches_are_refused_and_repetitions_are_not() -> None:
+    places, measured = np.append(STRETCHES, 0.95), of_law(0.4)
+    repeated = forces(np.append(measured, measured[-1] + 1.0), places)
+    assert identify(repeated.model, [repeated], ["b"])["b"].value == pytest.approx(0.4, abs=0.05)
+    with pytest.raises(IdentificationError, match=r"131\.1 N and 200 N at a = 950 mm: give one branch"):
+        forces(np.append(measured, 200.0), places)
+
+
+def test_a_short_part_of_the_range_is_said() -> None:
+    table = forces(100.0 * 1e-3 * STRETCHES, 1e-3 * STRETCHES)
+    text = lines(identify(table.model, [table], moduli=True))
+    assert "covers 0.09 % of the model's range of a: is the unit" in text
+
+
+def test_a_known_zero_is_not_fitted() -> None:
+    """The factor is that of the line through the origin."""
+    measured = 80.0 * STRETCHES + 5.0
+    table = forces(measured, free_zero=False)
+    found = identify(table.model, [table], moduli=True)
+    slope = float(STRETCHES @ measured / (STRETCHES @ STRETCHES)) / 100.0
+    assert found[FACTOR].value == pytest.approx(slope, rel=1e-6)
+    assert "offset" not in summarise(found)["measurements"][0]
+
+
+def points(stretches: list[float], turn: float = 0.0, shift: float = 0.0, aligned: bool = False) -> MeasuredPoints:
+    """The corners in each state, all turned about z and shifted along x."""
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    moved = np.vstack([CORNERS * [1.0 + a, 1.0, 1.0] for a in stretches]) @ rotation.T + [shift, 0.0, 0.0]
+    states, places = (
+        np.repeat([f"state {i}" for i, _ in enumerate(stretches)], 4),
+        np.tile(CORNERS, (len(stretches), 1)),
+    )
+    return MeasuredPoints(stretched_plate(), tuple(states), {}, places, moved, aligned)
+
+
+def test_points_of_another_frame_are_aligned() -> None:
+    table = points([0.2, 0.2, 0.2], turn=0.3, shift=2.0, aligned=True)
+    found = identify(table.model, [table], ["a"])
+    assert found["a"].value == pytest.approx(0.2, abs=1e-6)
+    assert found.misfits[0].rms < 1e-8
+    assert "moved by" in lines(found)
+    missing = table.measured.copy()
+    missing[3, 2] = np.nan
+    with pytest.raises(IdentificationError, match="all three measured coordinates"):
+        replace(table, measured=missing)
+
+
+def test_points_that_are_displacements_or_in_other_units_are_doubted() -> None:
+    right = points([0.2, 0.2, 0.4])
+    as_displacements = replace(right, measured=right.measured - right.places)
+    assert "check the units, and that x, y, z are positions" in lines(identify(right.model, [as_displacements], ["a"]))
+    in_other_units = replace(right, places=1e-3 * right.places, measured=1e-3 * right.measured)
+    assert "all points lie within 0.1 % of the object" in lines(identify(right.model, [in_other_units], ["a"]))
+    spread = points([0.2, 0.22, 0.18])
+    text = lines(identify(spread.model, [spread], ["a"]))
+    assert "check the units" not in text
+    assert "all points lie" not in text
+
+
+def test_what_stands_at_an_end_and_could_not_be_found_is_said_to_be_both() -> None:
+    """Forces with 200 N of noise, whose best law would be beyond the range."""
+    table = forces(of_law(1.6) + 200.0 * np.cos(9.0 * STRETCHES))
+    found = identify(table.model, [table], ["b"])
+    assert found["b"].value in (0.0, 1.0)
+    text = lines(found)
+    assert "note: b is at the end of its range\n" in text
+    assert "note: b could not be identified" in text
+    assert "95 % interval wider than its range, 0 to 1" in text
+
+
+def test_empty_cells_are_counted(tmp_path: Path) -> None:
+    rows = [f"{1e3 * a},{f}" for a, f in zip(STRETCHES, of_law(0.4), strict=True)]
+    rows[3], rows[7] = rows[3].split(",")[0] + ",", rows[7].split(",")[0] + ",nan"
+    (tmp_path / "curve.csv").write_text("a_mm,force_N\n" + "\n".join(rows) + "\n")
+    model = stretched_plate()
+    curve = load_curve(tmp_path / "curve.csv", model)
+    assert curve.empty == 2
+    table = MeasuredForces(model, curve, reaction_in_direction(model, "edge:x"))
+    assert "force_N is empty in 2 lines of its file" in lines(identify(model, [table], ["b"]))
+
+
+def test_tables_given_twice_and_too_short_ones_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_model(tmp_path / "plate.morph", stretched_plate())
+    curve = tmp_path / "curve.csv"
+    curve.write_text("a_mm,force_N\n100,10\n200,20\n300,30\n")
+    asked = ["identify", str(tmp_path / "plate.morph"), "--moduli", "-o", str(tmp_path / "out")]
+    once = ["--force", str(curve), "--reaction", "edge:x"]
+    assert cli.main([*asked, *once]) == 2
+    assert "3 forces in column 'force_N': give at least 4" in capsys.readouterr().err
+    curve.write_text("a_mm,force_N\n100,10\n200,20\n300,30\n400,40\n")
+    assert cli.main([*asked, *once, "--no-offset"]) == 0
+    assert cli.main([*asked, *once, "--force", f"{curve}:force_N", "--reaction", "edge:x"]) == 2
+    assert "is given twice" in capsys.readouterr().err
