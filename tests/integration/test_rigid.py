@@ -1,6 +1,7 @@
 """A rigid box without parameters, rendered in motion and tracked against its true poses."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,11 +10,13 @@ from morph_dslam import SimulatedSequence, Tracker, TrackerOptions, load_model, 
 from morph_dslam.camera import Camera
 from morph_dslam.cli import main
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.model import Parameter, SeparatedField, save_model
 from morph_dslam.registration.messages import LandmarksTurnedAway
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import State
+from tests.support.bent_tube import polynomial
 
 BOX = """
 v 0 0 0\nv 80 0 0\nv 0 60 0\nv 80 60 0\nv 0 0 50\nv 80 0 50\nv 0 60 50\nv 80 60 50
@@ -143,3 +146,35 @@ def test_the_edges_that_are_seen_are_drawn(folder):
     # Nor is a face white.
     faces = camera.project(pose.apply([nearest + 0.4 * (opposite - nearest) * [1, 1, 0]]))[0].round().astype(int)
     assert drawn[faces[1], faces[0]].max() < 200
+
+
+@pytest.fixture(scope="module")
+def halves(folder):
+    """The arguments of one half of the box, which can shear and holds stress and a force, and of the rigid other."""
+    sequence, linear = SimulatedSequence(folder / "scene.toml"), polynomial([[0.05], [0.05]])
+    whole, corners, pose = sequence.model, sequence.landmarks.points, sequence.camera_from_object[0]
+    for name, begin in (("soft", 0.0), ("hard", 40.0)):
+        points = corners * [0.5, 1.0, 1.0] + 1e-3 * np.array([begin, 0.0, 0.0])
+        save_landmarks(folder / f"{name}.csv", Landmarks(points, sequence.camera.project(pose.apply(points))))
+        half = replace(whole, name=name, nodes=whole.nodes * [0.5, 1.0, 1.0] + 1e-3 * np.array([begin, 0.0, 0.0]))
+        if name == "soft":
+            zero = np.zeros(len(half.nodes))
+            half = replace(
+                half,
+                parameters=(Parameter("shear", "ratio", "1", 0.0, 2.0, 0.0),),
+                displacement=SeparatedField(np.column_stack([half.nodes[:, 2], zero, zero])[None], linear),
+                stresses={"solid": SeparatedField(np.full((1, len(zero), 6), 1e5), linear)},
+                supports={"bottom": np.flatnonzero(half.nodes[:, 2] < 1e-6)},
+                reactions={"force_bottom": SeparatedField(np.full((1, 1, 3), 10.0), linear)},
+            )
+        save_model(folder / f"{name}.morph", half)
+    soft = ["--model", folder / "soft.morph", "--landmarks", folder / "soft.csv"]
+    return [*map(str, [*soft, "--also", "hard", folder / "hard.morph", folder / "hard.csv"])]
+
+
+@pytest.mark.parametrize("option", [["--forces"], ["--show", "stress"], []])
+@pytest.mark.usefixtures("command")
+def test_what_is_drawn_of_a_deformable_object_is_not_asked_of_a_rigid_one(folder, halves, tmp_path, option):
+    frames = [str(folder / "seq" / "frames"), "--camera", str(folder / "seq" / "camera.yaml")]
+    run = "track" if option else "live"  # which colours all by the same field
+    assert main([run, *frames, *halves, *option, "-o", str(tmp_path / "run")]) == 0

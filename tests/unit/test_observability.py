@@ -1,7 +1,10 @@
 """What the images do not tell, and how far off what they tell may be: known blind combinations, samples."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
@@ -214,3 +217,20 @@ def test_stress_spreads_as_stated(estimate, drawn, components):
     seen = stresses.mean(axis=0) > 0.1 * stresses.max()
     stated = von_mises_std(model, estimate, "top")
     np.testing.assert_allclose(stated[seen], stresses.std(axis=0)[seen], rtol=0.1)
+
+
+def test_positions_in_the_camera_frame_are_as_well_known_as_shape_and_pose_together():
+    """Against states drawn from the covariance."""
+    result = run_of(("shear",)).results[-1]
+    rng, known = np.random.default_rng(1), result.estimate.state
+    covariance = 1e-4 * np.diag([1.0, 0.0, 1.0, 0.0, *[0.04] * 3, *[1e-4] * 3])
+    result = replace(result, estimate=replace(result.estimate, covariance=covariance))
+    here, squared = result.positions(), np.zeros(len(MODEL.nodes))
+    steps = rng.multivariate_normal(np.zeros(10), covariance, 4000)
+    for step in steps:
+        parameters = known.parameters + step[:4]
+        pose = known.camera_from_object
+        turned = (MODEL.nodes + MODEL.displacement.value(parameters)) @ pose.rotation.T
+        there = Rotation.from_rotvec(step[4:7]).apply(turned) + pose.translation + step[7:]
+        squared += np.sum((there - here) ** 2, axis=1)
+    assert result.position_std() == pytest.approx(np.sqrt(squared / len(steps)), rel=0.06)

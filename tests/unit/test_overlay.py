@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.render.overlay import BarPlace, Panel, draw_overlay, paint_surface
-from morph_dslam.render.shading import colour_bar, colour_table, flat_colour_bar, lambert, vertex_normals
+from morph_dslam.render.shading import colour_bar, colour_table, flat_colour_bar, lambert, text_patch, vertex_normals
 from tests.support.bent_sheet import LENGTH, bent_sheet_model
 
 PIXELS = np.array([[20.0, 40.0], [119.0, 40.0], [119.0, 139.0], [20.0, 139.0]])
@@ -139,3 +139,14 @@ def test_only_the_part_of_the_image_with_the_surface_is_painted():
 def test_lambert_is_two_sided():
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
     np.testing.assert_allclose(lambert(normals, np.array([0, 0, 5.0]), 0.3), [1.0, 1.0, 0.3, 0.3 + 0.7 * 0.8])
+
+
+def test_a_text_that_is_too_long_for_a_picture_goes_on_in_further_lines():
+    text = "frame 124: lost: too few points of the object agree on one place, 12 of 200 where 20 are needed"
+    line, wrapped = text_patch(text, 0.4), text_patch(text, 0.4, 200)
+    assert line.shape[1] > 400
+    assert wrapped.shape[1] <= 200
+    assert wrapped.shape[0] >= 3 * line.shape[0]
+    # All of it is there: as much that is light.
+    light = [int((patch > 128).sum()) for patch in (line, wrapped)]
+    assert light[1] == pytest.approx(light[0], rel=0.05)

@@ -32,7 +32,7 @@ from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.camera_check import CameraCheck
 from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
-from morph_dslam.tracking.drawing import AugmentedView, write_video
+from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
 from morph_dslam.tracking.frame_estimation import temporal_facts
 from morph_dslam.tracking.frame_log import FrameLog, check_frame_log
 from morph_dslam.tracking.hypothesis import Image
@@ -208,7 +208,7 @@ class _Job:
 
     def __init__(self, stack: ExitStack, run: TrackOptions, source: Any, placed: list[PlacedObject]) -> None:
         self._run, self._source, self._placed = run, source, placed
-        self._views = [_view_of(part, run) for part in placed]
+        self._views = _views_of(placed, run)
         for folder in run.folders:
             stack.enter_context(only_writer(folder))
         self._folders = [
@@ -289,7 +289,7 @@ class _Job:
             seen = [keyframe for frame, keyframe in self._seen[part.name] if frame < end]
             placed.append(_refined(part, seen, run))
         with self._interrupts:  # until then the frames of the pass before are the results
-            self._placed, self._views = placed, [_view_of(part, run) for part in placed]
+            self._placed, self._views = placed, _views_of(placed, run)
             for folder, part in zip(self._folders, placed, strict=True):
                 folder.start_again(part.new_results(refined=isinstance(part.object.start, Landmarks)), part.camera)
             sinks: list[Sink] = [*self._folders]
@@ -425,12 +425,16 @@ def _shown_of(part: PlacedObject, run: TrackOptions) -> Shown | None:
     return "displacement" if part.options.use_discrepancy and run.drawing.show is None else run.drawing.show
 
 
-def _view_of(part: PlacedObject, run: TrackOptions) -> AugmentedView:
-    """Draws an object."""
-    drawing = replace(run.drawing, show=_shown_of(part, run))
-    if not part.model.parameters and len(run.objects) > 1:
-        drawing = replace(drawing, forces=False)  # those of the others
-    return AugmentedView(part.model, part.camera, drawing, part.inner)
+def _views_of(placed: Sequence[PlacedObject], run: TrackOptions) -> list[AugmentedView]:
+    """What draws each object; of a rigid one beside others there is nothing to choose."""
+    some_deform = any(part.model.parameters for part in placed)
+    views = []
+    for part in placed:
+        drawing = replace(run.drawing, show=_shown_of(part, run))
+        if some_deform and not part.model.parameters:
+            drawing = DrawOptions()
+        views.append(AugmentedView(part.model, part.camera, drawing, part.inner))
+    return views
 
 
 def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -> PlacedObject:
