@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -218,3 +219,32 @@ def test_a_finer_solution_on_another_branch_is_left_out(
     entry = discretisation_errors(*solved, 0.0)
     assert list(entry) == ["not_estimated"]
     assert "another stability" in entry["not_estimated"]
+
+
+def test_nodes_where_the_finer_solution_has_no_stress_are_left_out_and_counted() -> None:
+    """One node is pressed into a soft block, so that cells of third order beside it are turned inside out."""
+    content = {
+        "name": "pressed",
+        "mesh": {"generator": "block", "size": ["20 mm"] * 3, "divisions": [2, 2, 2], "cells": "tet4"},
+        "sets": {"tip": {"nearest": ["10 mm", "10 mm", "20 mm"]}},
+        "materials": {"soft": {"law": "neo_hookean", "young": "60 kPa", "poisson": 0.45}},
+        "supports": [
+            {"kind": "fixed", "on": "z_min"},
+            {"kind": "displacement", "on": "tip", "x": "0 mm", "y": "0 mm", "z": "-1 * press"},
+        ],
+        "parameters": {"press": {"range": ["0 mm", "6 mm"]}},
+        "sampling": {"scheme": "even", "training": 8, "held_out": 4, "refined": 1},
+        "reduction": {"method": "pod"},
+        "solver": {"workers": 1, "threads": 1},
+    }
+    model = md.build(md.make_study(content))
+    entry = model.certificate["discretisation"]
+    json.dumps(entry, allow_nan=False)
+    assert 0 < entry["singular_nodes"] < len(model.nodes) / 2
+    facts = error_facts(model)
+    assert f"up to {entry['singular_nodes']} nodes" in facts["nodes left out"]
+    assert "von Mises stress" in facts["total error"]
+    # As files of earlier versions have it.
+    for errors in (entry["errors"]["stress_solid"]["von_mises"], entry["errors"]["strain"]):
+        errors["relative_l2"] = float("nan")
+    assert not any("nan" in text for text in error_facts(model).values())

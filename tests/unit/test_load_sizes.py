@@ -24,6 +24,11 @@ BLOCK = {
 TRACTION = {"kind": "traction", "on": "z_max", "traction": ["0 Pa", "-1 * t", "0 Pa"]}
 
 
+FORCE = {"on": "z_max", "force": ["0 N", "0 N", "f"]}
+LINE = {"kind": "moving_line", "direction": [0, 1, 0], "force": ["0 N/mm", "0 N/mm", "f"]}
+MOVING = {"centre": ["10 mm", "10 mm", "40 mm"], "width": "4 mm"}
+
+
 def advice(load, **ranges):
     parameters = {name: {"range": list(ends)} for name, ends in ranges.items()}
     return make_study(BLOCK | {"loads": [load], "parameters": parameters}).advice
@@ -42,12 +47,17 @@ def pressure(value):
         (pressure("p + 0.5 * q"), {"p": ("0 kPa", "1 MPa"), "q": ("0 MPa", "1 MPa")}, "reaches 1.5 MPa, 30 times"),
         (TRACTION, {"t": ("0 MPa", "5 MPa")}, "100 times"),
         (pressure("p"), {"p": ("0 kPa", "990 kPa")}, None),
-        ({"kind": "force", "on": "z_max", "force": ["0 N", "0 N", "f"]}, {"f": ("0 N", "1 kN")}, None),
+        # Over 4 cm2; and at their centres F / (2 pi w^2) and F / (sqrt(2 pi) w), with w = 4 mm.
+        (FORCE | {"kind": "force"}, {"f": ("0 N", "1 kN")}, "Load 1 reaches 2.5 MPa, 50 times"),
+        (FORCE | {"kind": "force"}, {"f": ("0 N", "390 N")}, None),
+        (FORCE | MOVING | {"kind": "moving_patch"}, {"f": ("0 N", "1 kN")}, "Load 1 reaches 9.95 MPa, 199 times"),
+        (FORCE | MOVING | LINE, {"f": ("0 N/mm", "50 N/mm")},
+         "Load 1 reaches 4.99 MPa, 100 times"),
     ],
 )  # fmt: skip
 def test_stresses_that_no_such_material_bears(load, ranges, said):
     found = advice(load, **ranges)
-    assert ("is its unit right" in found) == (said is not None)
+    assert ("are its unit and that of the modulus right" in found) == (said is not None)
     assert (said or "Narrow the ranges") in found
     assert said is None or "the stiffest material (50 kPa)" in found
 

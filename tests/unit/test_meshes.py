@@ -5,12 +5,14 @@ from math import factorial
 
 import numpy as np
 import pytest
+import trimesh
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.generators import SOLIDS, block, tube
 from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
-from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces
+from morph_dslam.meshing.mesh_summary import faces_figures
+from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_found_surfaces
 from morph_dslam.meshing.second_order import FIRST_ORDER, to_second_order
 from morph_dslam.model.cell_types import cell_type
 from tests.support.meshes import SHEET, cell_volumes
@@ -91,6 +93,31 @@ def test_a_set_takes_in_the_middle_nodes_between_its_members_alone():
 def test_cells_of_second_order_get_no_more_nodes():
     with pytest.raises(StudyError, match="quad9 cells cannot be given middle nodes"):
         to_second_order(to_second_order(SHEET))
+
+
+def fan(surface):
+    """Tetrahedra between the triangles of a closed convex surface and its middle."""
+    nodes = np.vstack([surface.vertices, np.mean(surface.vertices, axis=0)])
+    middle = np.full(len(surface.faces), len(nodes) - 1)
+    return Mesh(nodes, (CellBlock("tet4", np.column_stack([surface.faces, middle])),))
+
+
+def test_a_flat_end_is_one_surface_though_single_precision_and_decimation_leave_it_uneven():
+    drawn = trimesh.creation.box((0.1, 0.08, 0.04)).subdivide().subdivide()
+    uneven = np.random.default_rng(0).uniform(-1e-6, 1e-6, drawn.vertices.shape)
+    mesh = with_found_surfaces(fan(trimesh.Trimesh(drawn.vertices + uneven, drawn.faces, process=False)))
+    areas = {"x": 0.08 * 0.04, "y": 0.1 * 0.04, "z": 0.1 * 0.08}
+    found = {name: faces_figures(mesh, faces)[0] for name, faces in mesh.surfaces.items()}
+    assert found == pytest.approx({f"{axis}_{end}": areas[axis] for axis in "xyz" for end in ("min", "max")}, rel=1e-4)
+
+
+def test_curved_surfaces_have_no_flat_ends_however_fine():
+    """A pole's next nodes are 2e-5 of the sphere's diameter away from its end, the side's 8e-5 of the cylinder's."""
+    assert not with_found_surfaces(fan(trimesh.creation.uv_sphere(0.05, count=(360, 40)))).surfaces
+    upright = with_found_surfaces(fan(trimesh.creation.cylinder(0.05, 0.1, sections=360)))
+    assert upright.surfaces.keys() == {"z_min", "z_max"}
+    side = np.pi * 0.05**2
+    assert faces_figures(upright, upright.surfaces["z_min"])[0] == pytest.approx(side, rel=1e-4)
 
 
 def test_unknown_names_are_refused_with_the_known_ones():

@@ -306,8 +306,15 @@ def test_force_that_lands_is_not_warned_of():
     assert not study_warnings(make_study(SOLID | {"loads": [LINE | {"width": "3 mm"}], "parameters": inside}))
     off = {"p": {"range": ["200 mm", "300 mm"]}}
     for load in (PATCH, LINE):
-        (said,) = study_warnings(make_study(SOLID | {"loads": [load | {"width": "3 mm"}], "parameters": off}))
-        assert said.startswith("load 1: nothing of the force lands on 'z_max' where p = 200 mm")
+        study = make_study(SOLID | {"loads": [load | {"width": "3 mm"}], "parameters": off})
+        with pytest.raises(StudyError, match="load 1: nothing of the force lands on 'z_max' anywhere in the ranges"):
+            study_warnings(study)
+
+
+def test_a_force_that_passes_over_its_surface_between_the_ends_of_the_range_is_not_refused():
+    passing = {"p": {"range": ["-60 mm", "80 mm"], "default": "-60 mm"}}
+    (said,) = study_warnings(make_study(SOLID | {"loads": [PATCH | {"width": "3 mm"}], "parameters": passing}))
+    assert said.startswith("load 1: nothing of the force lands on 'z_max' where p = -60 mm")
 
 
 TUBE = {

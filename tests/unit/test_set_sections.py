@@ -11,6 +11,7 @@ import trimesh
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.mesh_summary import faces_figures
+from morph_dslam.studies.provenance import study_warnings
 from morph_dslam.studies.solid_sections import mesh_fingerprint
 from morph_dslam.studies.study import make_study
 
@@ -35,6 +36,28 @@ def mesh_with(**section):
 
 def area(mesh, name="chosen"):
     return faces_figures(mesh, mesh.surface(name))[0]
+
+
+def warnings_of(radius, divisions, near=(20, 10, 10), on="chosen", **section):
+    """What is said of a ball about a point of the block's top, which a load is on."""
+    mesh = BLOCK["mesh"] | {"divisions": divisions}
+    sets = {"chosen": {"near": mm(*near), "radius": f"{radius} mm"} | section}
+    loads = [{"kind": "pressure", "on": on, "pressure": "p"}]
+    return study_warnings(make_study(BLOCK | {"mesh": mesh, "sets": sets, "loads": loads}))
+
+
+def test_a_ball_of_which_coarse_cells_leave_little_is_named():
+    """A ball about the middle of a square of 5 mm holds this alone, of pi 7^2 = 154 mm2."""
+    (said,) = warnings_of(7, [8, 4, 2], near=(22.5, 12.5, 10))
+    assert said.startswith("sets.chosen: its whole faces cover 25 of the 154 mm2 of the surface that lie in the ball")
+
+
+def test_a_ball_that_cells_fill_is_not_named():
+    assert not warnings_of(8, [40, 20, 2])
+    assert not warnings_of(7.2, [8, 4, 2]), "four squares of 5 mm are 0.61 of the circle"
+    assert not warnings_of(12, [8, 4, 2]), "the ball reaches the bottom and the sides too"
+    assert not warnings_of(4, [8, 4, 2], near=(20, 10, 7), on="z_max"), "no support or load is on it"
+    assert not warnings_of(7, [8, 4, 2], near=(22.5, 12.5, 10), facing=[0, 0, 1]), "faces are chosen otherwise too"
 
 
 def test_a_box_holds_nodes_faces_and_cells():

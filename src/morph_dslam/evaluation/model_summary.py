@@ -109,6 +109,11 @@ def error_facts(model: ReducedModel) -> Facts:
     }
     if ENTRY in discretisation:
         facts["as errors of the parameters"] = _as_parameters(model, discretisation[ENTRY][ERRORS])
+    if discretisation.get("singular_nodes"):
+        facts["nodes left out"] = (
+            f"strain and stress at up to {discretisation['singular_nodes']} nodes, where cells of the finer solution "
+            "are turned inside out, as at a sharp rim of a support or load: there no mesh tells them"
+        )
     if "left_out" in discretisation:
         facts["states left out"] = discretisation["left_out"]
     described = [describe_point(model.parameters, state) for state in states]
@@ -134,9 +139,14 @@ def main_errors(errors: Mapping[str, Any]) -> dict[str, float]:
     stresses = [entry["von_mises"] for name, entry in errors.items() if name.startswith("stress_")]
     reactions = [entry for name, entry in errors.items() if name.startswith("reaction_")]
     for title, entries in (("von Mises stress", stresses), ("reactions", reactions)):
-        relative = [entry["relative_l2"] for entry in entries if entry.get("relative_l2") is not None]
+        relative = [entry["relative_l2"] for entry in entries if _is_known(entry.get("relative_l2"))]
         figures |= {title: 100.0 * max(relative)} if relative else {}
     return figures
+
+
+def _is_known(value: float | None) -> bool:
+    """Whether an error is stated; certificates of earlier versions hold NaN where a finer solution has no stress."""
+    return value is not None and bool(np.isfinite(value))
 
 
 def _in_words(figures: Mapping[str, float]) -> str:
@@ -314,7 +324,7 @@ def _relative(errors: Mapping[str, Any]) -> list[str]:
 
 
 def _number(value: float | None, form: str) -> str:
-    if value is None:
+    if value is None or not _is_known(value):
         return _UNKNOWN
     # Thousands in full, not as a power of ten.
     return f"{value:.0f}" if abs(value) >= 1e3 else f"{value:{form}}".removesuffix(".")

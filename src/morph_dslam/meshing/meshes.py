@@ -272,8 +272,11 @@ def find_faces(mesh: Mesh, corners: Indices) -> Indices:
     return np.vstack([faces, [[-1, -1]]])[first[ids[len(known) :]]]
 
 
-#: Faces end a mesh along an axis if they are this part of its length there away from its end at most.
-AT_END = 1e-6
+#: Faces end a mesh along an axis if they are this part of its length there away from its end at most; single precision
+#: and the decimation of surfaces leave such a flat end uneven.
+AT_END = 1e-4
+#: The most that faces which join go away from the end, as a part of their width: more is the pole of a curved surface.
+CURVED = 1e-3
 
 
 def end_surfaces(mesh: Mesh) -> dict[str, Indices]:
@@ -286,8 +289,24 @@ def end_surfaces(mesh: Mesh) -> dict[str, Indices]:
     for axis, letter in enumerate("xyz"):
         for name, end in (("min", low[axis]), ("max", high[axis])):
             away = np.nanmax(np.abs(points[:, :, axis] - end), axis=1)
-            found[f"{letter}_{name}"] = faces[away <= AT_END * (high[axis] - low[axis])]
+            near = away <= AT_END * (high[axis] - low[axis])
+            found[f"{letter}_{name}"] = faces[near][_flat(mesh, faces[near], away[near])]
     return {name: ends for name, ends in found.items() if len(ends)}
+
+
+def _flat(mesh: Mesh, faces: Indices, away: Array) -> NDArray[np.bool_]:
+    """Which of faces (f, 2), ``away`` (f,) from a plane, m, lie in it with all that join them (`CURVED`)."""
+    flat = np.zeros(len(faces), dtype=bool)
+    parts = parts_of(mesh, faces) if len(faces) else np.empty(0)
+    for part in np.unique(parts):
+        of_part = parts == part
+        corners = mesh.nodes[mesh.face_triangles(faces[of_part])]
+        area = (
+            np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
+        )
+        width = area / np.ptp(corners.reshape(-1, 3), axis=0).max()
+        flat[of_part] = away[of_part].max() <= CURVED * width
+    return flat
 
 
 def with_found_surfaces(mesh: Mesh) -> Mesh:

@@ -124,6 +124,9 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         chosen.check_parameters_used()
         mesh_notes = _announce_mesh(chosen)
     _announce_doubts(chosen)
+    if not isinstance(chosen, ExternalStudy) and chosen.sampling.scheme == "adaptive":
+        most = f"sampling: at most {chosen.sampling.training} solves, {chosen.sampling.first} of them first and more "
+        announce(f"{most}where the error is large; then {chosen.sampling.held_out} held-out ones")
     snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
     _check_held_out(chosen, snapshots, output)
     model = certified_model(snapshots, chosen.reduction, chosen.name, _fallback(study.reduction))
@@ -171,8 +174,9 @@ def _announce_mesh(study: SolidStudy | ShellStudy) -> list[str]:
 
 def _announce_doubts(study: Study) -> None:
     """Print what is probably not meant in a study, before it is solved for long."""
-    sized = shell_load_doubt(study.problem()).strip() if isinstance(study, ShellStudy) else ""
-    for sentence in filter(None, (*study_warnings(study), sized)):
+    sized = shell_load_doubt(study.problem()) if isinstance(study, ShellStudy) else ""
+    sized = study.load_doubt() if isinstance(study, SolidStudy) else sized
+    for sentence in filter(None, (*study_warnings(study), sized.strip())):
         announce(f"note: {sentence[0].lower()}{sentence[1:]}")
 
 

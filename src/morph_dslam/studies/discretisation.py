@@ -63,6 +63,8 @@ BYTES_OF_A_MILLION = 45e9
 ITERATIVE_TANGENTS, ITERATIVE_BYTES = 6.0, 12e3
 #: Highest order of a shell's displacements.
 FINEST_SHELL = 3
+#: Fields that follow from derivatives of the displacement, and part of the nodes that must have them for an estimate.
+NODAL, FEWEST_REGULAR = {"strain", "stress_solid", "stress_top", "stress_bottom"}, 0.5
 #: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
 TOLERANCE, PART = 1e-2, 0.03
 
@@ -93,6 +95,7 @@ def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedMode
     dict
         "method"; "unknowns" of the study's solid and of the finer one; "coordinates" of the states; "errors" of the
         held-out solutions against the finer ones by field, at the nodes of the model (`certificate.field_errors`);
+        "singular_nodes", the most that a finer solution has no strain or stress at, which these errors leave out;
         "parameters", what they amount to in these (`parameter_errors`); "left_out", why some states are missing. Or
         only "not_estimated", the reason.
     """
@@ -359,13 +362,25 @@ def _figures(
         for index, state in sorted(solved.items())
     ]
     shapes = [(own.coordinates, own.fields["displacement"], truth.fields["displacement"]) for own, truth in pairs]
+    known = [_regular_nodes(truth) for _, truth in pairs]
+    if min(mask.mean() for mask in known) < FEWEST_REGULAR:
+        raise _NotEstimated(f"the finer solution has no stress at {max((~mask).sum() for mask in known)} nodes")
+
+    def errors(name: str) -> dict[str, Any]:
+        values = [(own.fields[name], truth.fields[name]) for own, truth in pairs]
+        nodal = name in NODAL
+        return field_errors(name, [(a[k], b[k]) if nodal else (a, b) for (a, b), k in zip(values, known, strict=True)])
+
     return {
         "method": f"displacements of order {finer.displacements.order} on the same cells",
         "unknowns": _unknowns(coarse, finer),
         "coordinates": [own.coordinates.tolist() for own, _ in pairs],
-        "errors": {
-            name: field_errors(name, [(own.fields[name], truth.fields[name]) for own, truth in pairs])
-            for name in model.fields
-        },
+        "errors": {name: errors(name) for name in model.fields},
+        "singular_nodes": max(int((~mask).sum()) for mask in known),
         ENTRY: parameter_errors(model, shapes),
     }
+
+
+def _regular_nodes(solution: Snapshot) -> NDArray[np.bool_]:
+    """Where (n,) strain and stress are numbers: laws have none where a cell is turned inside out, as at a sharp rim."""
+    return np.all([np.isfinite(solution.fields[name]).all(axis=1) for name in NODAL & solution.fields.keys()], axis=0)

@@ -11,11 +11,13 @@ from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.loads import Gravity
 from morph_dslam.mechanics.materials.base import Material, isotropic_average
 from morph_dslam.mechanics.shell_problem import ShellProblem
+from morph_dslam.meshing.mesh_summary import faces_figures
+from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.body_study import numbered, range_ends
-from morph_dslam.studies.solid_sections import Value
+from morph_dslam.studies.solid_sections import ForceLoad, MovingLineLoad, MovingPatchLoad, Value
 
 #: Loads of more than so many shear moduli carry no rubber's shape any more: their unit is probably wrong.
 MOST_MODULI = 20.0
@@ -23,21 +25,22 @@ MOST_MODULI = 20.0
 MOST_SIZES = 20.0
 
 
-def load_doubt(loads: Iterable[Any], materials: Iterable[Any], parameters: Sequence[Parameter]) -> str:
-    """A sentence on the first pressure or traction that is far too large for the stiffest material; else "".
+def load_doubt(loads: Iterable[Any], materials: Iterable[Any], mesh: Mesh, parameters: Sequence[Parameter]) -> str:
+    """A sentence on the first load on a surface that is far too large for the stiffest material; else "".
 
     Parameters
     ----------
     loads, materials : sections of a study.
+    mesh : with the surfaces that loads name.
     parameters : that they may name; materials count at the defaults, loads where the ranges make them largest.
     """
     shear = max(_shear_modulus(section, parameters) for section in materials)
     for where, section in numbered("load", loads):
-        largest = _largest_stress(section, parameters)
+        largest = _largest_stress(section, mesh, parameters)
         if largest > MOST_MODULI * shear:
             return (
                 f"{where.capitalize()} reaches {_shown(largest)}, {largest / shear:.0f} times the shear modulus of the "
-                f"stiffest material ({_shown(shear)}): is its unit right? "
+                f"stiffest material ({_shown(shear)}): are its unit and that of the modulus right? "
             )
     return ""
 
@@ -78,22 +81,38 @@ def _shear_modulus(section: Any, parameters: Sequence[Parameter]) -> float:
     return isotropic_average(made.small_strain_stiffness())[1]
 
 
-def _largest_stress(section: Any, parameters: Sequence[Parameter]) -> float:
-    """The largest pressure, or component of a traction, anywhere in the ranges of the parameters, Pa."""
+def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter]) -> float:
+    """The largest pressure, or component of a traction, anywhere in the ranges of the parameters, Pa.
+
+    Forces over a surface count with their mean, those of moving loads with that at their centre on a plane.
+    """
+    over = {"pressure": 1.0, "stress": 1.0} | _areas(section, mesh)
     ends = np.array([[parameter.lower, parameter.upper] for parameter in parameters])
     largest = [0.0]
 
     def read(value: Value, quantity: str | None) -> float:
         found = read_affine(value, quantity, parameters)
-        if quantity in ("pressure", "stress"):
+        if quantity in over:
             terms = np.array(found.slopes)[:, None] * ends
             sums = found.constant + np.array([terms.min(axis=1).sum(), terms.max(axis=1).sum()])
-            largest.append(float(np.abs(sums).max()))
+            largest.append(float(np.abs(sums).max()) / over[quantity])
         return found.constant
 
     section.make(read)
     return max(largest)
 
 
+def _areas(section: Any, mesh: Mesh) -> dict[str, float]:
+    """Area, m2, or width, m, that a force or force per length of a load is spread over, by the quantity."""
+    if isinstance(section, ForceLoad):
+        return {"force": faces_figures(mesh, mesh.surface(section.on))[0]}
+    if isinstance(section, MovingPatchLoad):
+        return {"force": 2.0 * np.pi * section.width**2}
+    if isinstance(section, MovingLineLoad):
+        return {"force per length": np.sqrt(2.0 * np.pi) * section.width}
+    return {}
+
+
 def _shown(stress: float) -> str:
-    return f"{1e-6 * stress:.3g} MPa" if stress >= 1e6 else f"{1e-3 * stress:.3g} kPa"
+    unit, size = next(((unit, size) for unit, size in (("MPa", 1e6), ("kPa", 1e3)) if stress >= size), ("Pa", 1.0))
+    return f"{stress / size:.3g} {unit}"

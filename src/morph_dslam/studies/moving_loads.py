@@ -56,9 +56,7 @@ def check_reach(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter
     Looked at are the defaults, the ends of the parameters' ranges and states spread within.
     """
     length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
-    within = np.random.default_rng(0).uniform(size=(TRIED, len(parameters)))
-    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
-    states = [np.array([p.default for p in parameters]), *(lower + within * (upper - lower))]
+    states = _spread_states(parameters)
     states += [mu for _, mu in range_ends(parameters, list(range(len(parameters))), True)]
     for where, load in _moving(loads):
         nodes = mesh.nodes[np.unique(mesh.face_triangles(_faces(mesh, load.on)))]
@@ -70,6 +68,13 @@ def check_reach(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter
                 f"{where}: its centre stays {1e3 * distance:.4g} mm or more away from '{load.on}', and the mesh is "
                 f"{1e3 * length:.4g} mm long: check the units of the centre and of the mesh"
             )
+
+
+def _spread_states(parameters: Sequence[Parameter]) -> list[Array]:
+    """The defaults (d,) of the parameters, and states spread within their ranges."""
+    within = np.random.default_rng(0).uniform(size=(TRIED, len(parameters)))
+    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
+    return [np.array([p.default for p in parameters]), *(lower + within * (upper - lower))]
 
 
 def _distances(load: Moving, nodes: Array, centre: Array) -> Array:
@@ -85,6 +90,7 @@ def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Para
     """A sentence for each moving load a part of whose force falls beside its surface.
 
     Looked at are the defaults of the parameters, and the ends of the ranges of those that move the load or the shape.
+    Raises StudyError where nothing lands there nor at states spread within the ranges.
     """
     found = []
     for where, load in _moving(loads):
@@ -93,15 +99,22 @@ def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Para
         used = np.flatnonzero(np.any(slopes, axis=0)).tolist()
         states = [np.array([p.default for p in parameters]), *(mu for _, mu in range_ends(parameters, used, True))]
         faces = mesh.face_triangles(_faces(mesh, load.on))
-        shares = [_share(load, moved_nodes(mesh, shape, mu)[faces], np.array([c(mu) for c in centre])) for mu in states]
+
+        def share(mu: Array, load: Moving = load, faces: Any = faces, centre: Any = centre) -> float:
+            return _share(load, moved_nodes(mesh, shape, mu)[faces], np.array([c(mu) for c in centre]))
+
+        shares = [share(mu) for mu in states]
         worst = int(np.argmin(shares))
-        if shares[worst] < LANDED:
-            state = state_text([parameters[k] for k in used], states[worst][used])
-            at = f" where {state}" if used else ""
-            landed = f"only {100.0 * shares[worst]:.0f} %" if shares[worst] > NONE else "nothing"
-            place = np.array([c(states[worst]) for c in centre])
-            why = _why_beside(load, moved_nodes(mesh, shape, states[worst]), faces, place)
-            found.append(f"{where}: {landed} of the force lands on '{load.on}'{at}{why}")
+        if shares[worst] >= LANDED:
+            continue
+        place = np.array([c(states[worst]) for c in centre])
+        why = _why_beside(load, moved_nodes(mesh, shape, states[worst]), faces, place)
+        if max(shares) <= NONE and not (used and any(share(mu) > NONE for mu in _spread_states(parameters))):
+            anywhere = " anywhere in the ranges of the parameters" if used else ""
+            raise StudyError(f"{where}: nothing of the force lands on '{load.on}'{anywhere}{why}")
+        at = f" where {state_text([parameters[k] for k in used], states[worst][used])}" if used else ""
+        landed = f"only {100.0 * shares[worst]:.0f} %" if shares[worst] > NONE else "nothing"
+        found.append(f"{where}: {landed} of the force lands on '{load.on}'{at}{why}")
     return found
 
 

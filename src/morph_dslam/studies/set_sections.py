@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.hollows import hollow_wall
-from morph_dslam.meshing.mesh_summary import unit_normals
+from morph_dslam.meshing.mesh_summary import faces_figures, unit_normals
 from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.studies.sections import JOINED, Angle, Length, Number, PositiveLength, Section, SetName
 from morph_dslam.studies.solid_sections import mesh_fingerprint
@@ -23,6 +23,11 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 #: Normals this far from a direction face it, unless a set says otherwise, rad.
 FACING_ANGLE = np.pi / 4.0
+#: Whole faces that are a smaller part of what a ball cuts out of a surface are worth a warning, and that of a ball with
+#: this part of a disc's area at least: its middle is on the surface.
+COARSE, ON_SURFACE = 0.5, 0.5
+#: Pieces of a triangle's longest edge for each radius of a ball, and the most of an edge.
+PIECES, MOST_PIECES = 10, 60
 #: Nodes this far outside of a box, as a part of the mesh's length, still lie in it.
 TOLERANCE = 1e-9
 
@@ -138,6 +143,43 @@ def with_sets(mesh: Mesh, sets: Mapping[str, SetSection]) -> Mesh:
         except StudyError as error:
             raise StudyError(f"sets.{name}: {error}") from error
     return mesh
+
+
+def coarse_set_warnings(mesh: Mesh, sets: Mapping[str, SetSection]) -> list[str]:
+    """A sentence for each ball whose whole faces are far less than what it cuts out of the outer surface of a solid.
+
+    Looked at are balls alone, about points on the surface: a deeper one is for what lies inside.
+    """
+    found = []
+    for name, section in sets.items():
+        if section.radius is None or section.box is not None or section.chooses_faces:
+            continue
+        disc = np.pi * section.radius**2
+        cut = min(_area_within(mesh.nodes[mesh.surface_triangles()], section), disc)  # no back of a thin wall
+        covered = faces_figures(mesh, mesh.surfaces[name])[0] if name in mesh.surfaces else 0.0
+        if cut > ON_SURFACE * disc and covered < COARSE * cut:
+            found.append(
+                f"sets.{name}: its whole faces cover {1e6 * covered:.3g} of the {1e6 * cut:.3g} mm2 of the surface "
+                "that lie in the ball, for the cells are coarse: take smaller cells, or a larger radius"
+            )
+    return found
+
+
+def _area_within(triangles: Array, section: SetSection) -> float:
+    """Area, m2, of that part of triangles (t, 3, 3) which lies in the ball of a set; each is cut into equal pieces."""
+    assert section.radius is not None
+    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    reached = np.linalg.norm(triangles[:, 0] - np.array(section.near), axis=1) <= section.radius + edges
+    if not reached.any():
+        return 0.0
+    corner, sides = triangles[reached, :1], triangles[reached, 1:] - triangles[reached, :1]
+    n = int(np.clip(np.ceil(PIECES * edges[reached].max() / section.radius), 1, MOST_PIECES))
+    corners = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2)
+    sums = corners.sum(axis=1)
+    middles = np.concatenate([corners[sums < n] + 1.0 / 3.0, corners[sums < n - 1] + 2.0 / 3.0]) / n
+    points = corner + np.einsum("pk,tkx->tpx", middles, sides)
+    inside = section.holds(points.reshape(-1, 3), section.radius).reshape(len(points), -1).mean(axis=1)
+    return float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) @ inside) / 2.0
 
 
 def _faces_named(mesh: Mesh, name: str) -> Indices:

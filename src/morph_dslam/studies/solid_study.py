@@ -36,8 +36,15 @@ from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.moving_loads import check_reach, check_widths, landing_warnings
 from morph_dslam.studies.parameters import ParameterSection, TimeSection
 from morph_dslam.studies.problem import ModelMesh, SweepProblem
-from morph_dslam.studies.sections import ReductionSection, SamplingSection, Section, UnknownLoadsSection, WorkSection
-from morph_dslam.studies.set_sections import SetSection, with_sets
+from morph_dslam.studies.sections import (
+    JOINED,
+    ReductionSection,
+    SamplingSection,
+    Section,
+    UnknownLoadsSection,
+    WorkSection,
+)
+from morph_dslam.studies.set_sections import SetSection, coarse_set_warnings, with_sets
 from morph_dslam.studies.shape_sections import ShapeSection, read_shape, shape_fields, shape_fingerprints
 from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import (
@@ -195,7 +202,11 @@ class SolidStudy(BodyStudy, Section):
     @property
     def advice(self) -> str:
         """See `BodyStudy`; before it, loads that are too large for the materials by far."""
-        return load_doubt(self.loads, self.materials.values(), self.model_parameters()) + super().advice
+        return self.load_doubt() + super().advice
+
+    def load_doubt(self) -> str:
+        """A sentence, and a space, on a load that is too large for the materials by far; else ""."""
+        return load_doubt(self.loads, self.materials.values(), self.solid_mesh(), self.model_parameters())
 
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
@@ -315,11 +326,13 @@ class SolidStudy(BodyStudy, Section):
         return ViscousSweep(self.problem(), clock, self.time.step, self.time.rest or 0.0)
 
     def doubts(self) -> list[str]:
-        """See `BodyStudy`: loads that fall beside their surface."""
+        """See `BodyStudy`: sets that cover little of their ball, loads that fall beside their surface."""
         mesh, parameters = self.solid_mesh(), self.model_parameters()
+        named = {part for _, name, what in self._sets() if what != "cells" for part in name.split(JOINED)}
+        coarse = coarse_set_warnings(mesh, {name: part for name, part in self.sets.items() if name in named})
         moves = any(load.kind in ("moving_patch", "moving_line") for load in self.loads)
         shape = read_shape(self.shape, mesh, parameters) if moves else ()
-        return landing_warnings(self.loads, mesh, parameters, shape)
+        return coarse + landing_warnings(self.loads, mesh, parameters, shape)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""
