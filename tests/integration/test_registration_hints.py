@@ -14,7 +14,14 @@ from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.registration import mesh, register as registering
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, register_mesh
 from morph_dslam.registration.mesh_edges import MeshEdges
-from morph_dslam.registration.messages import NotRefined, OnlyInBox, TooLittleTexture, Unrefined, read_warning
+from morph_dslam.registration.messages import (
+    MeshOffSurface,
+    NotRefined,
+    OnlyInBox,
+    TooLittleTexture,
+    Unrefined,
+    read_warning,
+)
 from morph_dslam.registration.register import draw_registration, register
 from morph_dslam.registration.scene import camera_from_object
 from morph_dslam.registration.texture import Agreement, TextureComparison
@@ -72,13 +79,18 @@ def box_with(margin, pixels):
 
 @pytest.mark.parametrize("margin", [0.0, 0.1, 0.3])
 def test_a_box_with_any_usual_margin_leaves_the_object_where_it_is(scan, scene, unhinted, margin):
-    region = FRAME, box_with(margin, seen(scan[1][FRAME], NODES))
-    found = register(scene, bending_wedge(), region=region)
+    region, model = (FRAME, box_with(margin, seen(scan[1][FRAME], NODES))), bending_wedge()
+    model = replace(model, certificate={**model.certificate, "mesh_deviation": {"volume": -0.03, "mean_m": 1e-4}})
+    found = register(scene, model, region=region)
     assert not unhinted.ambiguous
     assert not found.ambiguous
     assert apart(unhinted) < 1.5e-3
     assert apart(found) < 1.5e-3
     assert found.facts["map_units_per_metre"] == pytest.approx(unhinted.facts["map_units_per_metre"], rel=0.01)
+    # A mesh that is smaller by 3 % in volume makes the distance wrong by 1 %.
+    away = np.linalg.norm(found.state.camera_from_object.apply(NODES.mean(axis=0)))
+    assert MeshOffSurface(-0.03, 1e-4) in found.warnings
+    assert found.pose_deviations()[0] > 0.01 * away > unhinted.pose_deviations()[0]
 
 
 def test_a_box_beside_the_object_is_named(scene):

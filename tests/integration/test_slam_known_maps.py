@@ -12,9 +12,20 @@ from morph_dslam.errors import MapError
 from morph_dslam.evaluation.trajectory import evaluate_trajectory
 from morph_dslam.io.colmap import ColmapImage, read_colmap_model, write_colmap_model
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
-from morph_dslam.slam.result import SlamStatus
-from morph_dslam.slam.scene import load_scene, map_scene
-from tests.support.rendered_room import CAMERA, Film, RoomFilm, hand_held, pose, write_film
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.result import NoPose, SlamReason, SlamStatus
+from morph_dslam.slam.scene import load_scene, map_scene, start_slam
+from tests.support.rendered_room import (
+    CAMERA,
+    PERIOD,
+    Film,
+    RoomFilm,
+    follow,
+    hand_held,
+    pose,
+    repeated_wall,
+    write_film,
+)
 
 #: Another program's world and unit.
 WORLD, UNIT = pose((3.0, -1.0, 2.0), (0.4, -0.2, 0.9)), 2.5
@@ -181,3 +192,47 @@ def test_the_command_takes_known_maps(tmp_path, room, room_folder, colmap, refus
         (["--images", str(room_folder / "film")], "--images"),
     ):
         assert words in refused(*command, *wrong, "-o", tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def repeating():
+    """A wall that looks the same again after a period, and a map of more than one."""
+    wall = RoomFilm(seed=1, scene=repeated_wall)
+    path = np.array([pose((x, 0.1 * np.sin(2 * x), 0.0)) for x in np.linspace(0.0, PERIOD + 0.4, 60)])
+    return wall, Film([wall.frame(place) for place in path]), Trajectory(np.arange(60) / 30.0, path)
+
+
+@pytest.fixture
+def seen_from(repeating):
+    """Follows a camera through places (metres to the right, None where it is covered); their frames."""
+    wall, recording, path = repeating
+    slam = start_slam(recording, CAMERA, SlamOptions(), path)
+    return lambda *places: follow(
+        slam, [np.zeros((480, 640), np.uint8) if x is None else wall.frame(pose((x, 0.05, 0.03))) for x in places]
+    )
+
+
+def rightwards(frame):
+    return np.linalg.inv(frame.pose.camera_from_world)[0, 3]
+
+
+def test_a_camera_is_not_placed_where_two_places_look_alike(seen_from):
+    for frame in seen_from(0.15, 0.15 + PERIOD, 0.15):
+        assert frame.status is SlamStatus.LOST
+        assert isinstance(frame.reason, NoPose)
+        assert frame.reason.reason is SlamReason.TWO_PLACES
+    found = seen_from(PERIOD / 2)[0]  # the map has less than a period to either side of it
+    assert rightwards(found) == pytest.approx(PERIOD / 2, abs=0.01)
+
+
+@pytest.mark.parametrize(("n_covered", "is_found"), [(12, True), (90, False)])
+def test_of_places_that_look_alike_the_one_is_taken_that_the_camera_can_have_reached(seen_from, n_covered, is_found):
+    """It goes on by a quarter of a period while it is covered: the other place is three quarters away."""
+    start = np.linspace(1.6, 0.95, 8).tolist()
+    frames = seen_from(*start, *[None] * n_covered, 0.15)
+    assert frames[7].status is SlamStatus.TRACKED
+    if is_found:
+        assert rightwards(frames[-1]) == pytest.approx(0.15, abs=0.01)
+    else:
+        assert frames[-1].status is SlamStatus.LOST
+        assert frames[-1].reason.reason is SlamReason.TWO_PLACES

@@ -68,6 +68,15 @@ def checkerboard(_rng):
     return wall(_rng)
 
 
+#: Metres after which the print of `repeated_wall` repeats itself: more than the camera sees at once.
+PERIOD = 3.2
+
+
+def repeated_wall(_rng):
+    """A wall of 12 m, straight ahead, whose print repeats itself from left to right."""
+    return [_rectangle([-3.0, -2.5, 2.4], [12.0, 0, 0], [0, 5.0, 0], [0, 0], cells=24)]
+
+
 def room_with_sheet(rng):
     """The room with a sheet 1.6 m before the camera: the last part, of `SHEET_NODES` nodes."""
     return [*room(rng), _rectangle([-0.45, -0.35, 1.6], [0.9, 0, 0.1], [0, 0.7, 0], [650, 250])]
@@ -111,6 +120,9 @@ class RoomFilm:
         if scene is checkerboard:
             squares = np.indices((95, 95)).sum(axis=0) % 2 == 0
             self.texture = np.kron(np.where(squares, 30, 220), np.ones((19, 19))).astype(np.uint8)
+            return
+        if scene is repeated_wall:
+            self.texture = np.tile(printed_texture(1050, round(DENSITY * PERIOD), seed), (1, 4))
             return
         tiles = [printed_texture(900, 900, seed + 100 * (i % prints)) for i in range(4)]
         self.texture = np.block([tiles[:2], tiles[2:]])

@@ -9,7 +9,7 @@ from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFai
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
-from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, Underdetermined
+from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, FewLandmarks, Underdetermined
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
@@ -118,6 +118,13 @@ def test_barely_enough_landmarks_are_flagged():
     found = register_landmarks(MODEL, CAMERA, Landmarks(landmarks().points[:4], landmarks().pixels[:4]))
     assert found.warnings == (Underdetermined(numbers=8, unknowns=9, enough=7),)
     assert found.facts["residual_rms_px"] < 0.1
+
+
+@pytest.mark.parametrize(("count", "is_said"), [(7, True), (8, False)])
+def test_few_landmarks_do_not_show_how_exact_they_are(count, is_said):
+    """Of 9 unknowns, 7 landmarks leave 5 numbers, which fit by chance better than the clicks are exact."""
+    found = register_landmarks(MODEL, CAMERA, landmarks(count=count))
+    assert found.warnings == ((FewLandmarks(7, 0.5, 8),) if is_said else ())
 
 
 def test_shape_beyond_the_range_is_flagged():

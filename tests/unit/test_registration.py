@@ -15,7 +15,16 @@ from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.mesh import register_mesh
-from morph_dslam.registration.messages import Ambiguity, Ambiguous, AngleOpen, AtBound, TurnArbitrary
+from morph_dslam.registration.mesh_error import mesh_error, with_mesh_error
+from morph_dslam.registration.messages import (
+    Ambiguity,
+    Ambiguous,
+    AngleOpen,
+    AtBound,
+    MeshOffSurface,
+    TurnArbitrary,
+    read_warning,
+)
 from morph_dslam.registration.register import run_registration, without_points_on
 from morph_dslam.registration.registration import (
     Axis,
@@ -26,6 +35,7 @@ from morph_dslam.registration.registration import (
     load_registration,
     registration_in_map,
 )
+from morph_dslam.registration.scene import View, views_apart
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.anchoring import Anchor, points_on_object
@@ -69,6 +79,39 @@ def test_the_stated_deviations_are_those_of_the_middle_of_the_object():
     # A keyframe's own covariance is one of a turn about the object's origin and a shift of it.
     own = np.diag([1e-4, 1e-4, 1e-4, 4e-6, 4e-6, 4e-6])
     assert stated(np.zeros(7), own) == pytest.approx((np.sqrt(4e-6 + 1e-4 * centre @ centre), 0.01))
+
+
+def test_a_mesh_that_is_off_its_surface_makes_the_place_less_exact():
+    """One that is 3 % smaller in volume is 1 % smaller, and so the object seems 1 % nearer."""
+    tube = bent_tube()
+    assert mesh_error(tube) is None
+    model = replace(tube, certificate={**tube.certificate, "mesh_deviation": {"volume": -0.03, "mean_m": 2e-4}})
+    error, centre = mesh_error(model), model.nodes.mean(axis=0)
+    assert error is not None
+    assert error.warning == MeshOffSurface(-0.03, 2e-4)
+    assert read_warning(error.warning.content()) == error.warning
+    pose = RigidTransform(rotation_exp(np.array([0.3, -0.4, 0.2])), np.array([0.05, -0.02, 0.6]))
+    away, radius = np.linalg.norm(pose.apply(centre)), np.sqrt(np.trace(np.cov(model.nodes.T, bias=True)))
+    expected = pytest.approx((np.hypot(0.01 * away, 2e-4), 2e-4 / radius))
+    exact = MapRegistration(SimilarityTransform(2.0, np.eye(3), np.zeros(3)), centre, np.zeros((7, 7)))
+    for view in (KeyframePose(3, pose), KeyframePose(3, pose, np.zeros((6, 6)), np.zeros((6, 8)))):
+        found, views = with_mesh_error(exact, [view], error.factors(model.nodes, 2.0))
+        assert registration_in_map(model, found, views, {}, ()).pose_deviations() == expected
+    assert views[0].error_factors @ views[0].error_factors.T == pytest.approx(views[0].covariance)
+
+
+def test_views_from_the_most_different_sides_are_chosen():
+    """Around a point at 1 m: two that are nearly the same, one a quarter round, and two between."""
+    image, none = np.zeros((2, 2), np.uint8), np.empty(0, dtype=np.int64)
+    views = []
+    for frame, degrees in ((0, 0.0), (2, 1.0), (58, 90.0), (70, 50.0), (80, 30.0)):
+        turn = rotation_exp(np.array([0.0, np.radians(degrees), 0.0]))
+        pose = RigidTransform(turn, np.array([0.0, 0.0, 1.0]))
+        views.append(View(frame, image, pose, none, np.empty((0, 2))))
+    point = np.zeros(3)
+    assert [view.frame for view in views_apart(views, point, 2, kept=58)] == [0, 58]
+    assert [view.frame for view in views_apart(views, point, 3, kept=2)] == [2, 58, 70]
+    assert [view.frame for view in views_apart(views, point, 9)] == [0, 2, 58, 70, 80]
 
 
 def test_a_rigid_body_of_revolution_is_placed_up_to_its_turn(tmp_path):

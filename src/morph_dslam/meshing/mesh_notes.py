@@ -89,6 +89,23 @@ def file_notes(mesh: Mesh, path: Path, unit: str, size: float | None = None) -> 
     return [*notes, *small_extent_note(np.ptp(mesh.nodes, axis=0), path, unit)]
 
 
+def file_deviation(mesh: Mesh, path: Path, unit: str, size: float | None) -> dict[str, float] | None:
+    """How far a mesh is off the surface of its file, for the certificate; None where results do not show it.
+
+    Parameters
+    ----------
+    mesh, path, unit, size : as of `file_notes`.
+    """
+    if mesh.is_sheet or size is None or file_kind(path) not in SURFACES:
+        return None
+    try:
+        surface, _ = closed_surface(path)
+    except StudyError:  # the file has changed since the mesh was made of it
+        return None
+    found = surface_deviation(mesh, to_si(1.0, unit, "length") * surface.points, surface.triangles)
+    return {"volume": found.volume, "mean_m": found.mean} if found.notable else None
+
+
 def _surface_notes(mesh: Mesh, path: Path, scale: float, size: float | None) -> Iterator[str]:
     try:
         surface, repairs = closed_surface(path)

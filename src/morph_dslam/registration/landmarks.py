@@ -29,6 +29,7 @@ from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
     AtBound,
+    FewLandmarks,
     PoorFit,
     RegistrationWarning,
     Underdetermined,
@@ -57,6 +58,8 @@ SPREAD_SHARE, SURFACE_SHARE = 0.12, 0.01
 RESIDUAL_SHARE = 0.005
 #: Both of hints about an object whose edges give its place in the end: they need not be exact, but no mistakes.
 HINT_RESIDUAL_SHARE, HINT_SURFACE_SHARE = 0.02, 0.05
+#: With fewer numbers to spare, residuals show the error of landmarks to a third at best.
+ENOUGH_SPARE = 6
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
 #: Landmarks in another unit must be spread over this share of the object: on a point they lie anywhere.
@@ -444,6 +447,9 @@ def _warnings(
         warnings.append(Underdetermined(numbers, unknowns, unknowns // 2 + 3))
     elif best.sigma_px > poor_px:
         warnings.append(PoorFit(best.sigma_px, click_px))
+    elif numbers - unknowns < ENOUGH_SPARE:
+        enough = -(-(unknowns + ENOUGH_SPARE) // 2)
+        warnings.append(FewLandmarks(len(points), max(best.sigma_px, click_px), enough))
     if not SIZES[0] < size < SIZES[1]:
         warnings.append(UnusualSize(size))
     if n_alternatives:

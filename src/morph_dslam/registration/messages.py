@@ -102,6 +102,26 @@ class PoorFit(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class FewLandmarks(RegistrationWarning):
+    """The landmarks are hardly more than the unknowns, so that their residuals do not show how exact they are.
+
+    Attributes
+    ----------
+    n_landmarks : of all.
+    assumed_px : standard deviation of their pixels that the covariance rests on.
+    enough : number of landmarks that would show it.
+    """
+
+    template: ClassVar[str] = (
+        "{n_landmarks} landmarks do not show how exactly they were set: the stated deviations assume {assumed_px:.2g} "
+        "px each, and go in proportion; give {enough} landmarks or more"
+    )
+    n_landmarks: int
+    assumed_px: float
+    enough: int
+
+
+@dataclass(frozen=True)
 class LandmarksTurnedAway(RegistrationWarning):
     """The camera would see the landmarks through the object.
 
@@ -357,6 +377,30 @@ class NotRefined(RegistrationWarning):
         """For people."""
         reason = _REASONS[Unrefined(self.why)].format(value=self.value)
         return f"the keyframes' images do not refine the object's place: {reason}"
+
+
+@dataclass(frozen=True)
+class MeshOffSurface(RegistrationWarning):
+    """The model's mesh differs from the surface that it was made from, and so does the place.
+
+    Attributes
+    ----------
+    volume : of the mesh over that of the surface, less one.
+    mean : distance between the two, metres.
+    """
+
+    volume: float
+    mean: float
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        return (
+            f"the model's mesh is {abs(self.volume):.1%} {'smaller' if self.volume < 0.0 else 'larger'} than the "
+            f"surface that it was made from, and {1e3 * self.mean:.2g} mm away from it on average, which the stated "
+            "deviations contain: register the surface itself (`morph build --rigid`), and track the model with that "
+            "registration"
+        )
 
 
 @dataclass(frozen=True)

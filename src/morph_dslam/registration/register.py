@@ -30,6 +30,7 @@ from morph_dslam.registration.landmarks import (
     on_surface,
 )
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
+from morph_dslam.registration.mesh_error import mesh_error, with_mesh_error
 from morph_dslam.registration.messages import OnlyInBox, OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
@@ -40,7 +41,7 @@ from morph_dslam.registration.registration import (
     read_content,
     registration_in_map,
 )
-from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, spread_views
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, views_apart, views_of
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
@@ -108,12 +109,17 @@ def register(
         "outline_share": _outline_share(found),
     }
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
+    keyframes = _keyframes(found, views)
     warnings = found.warnings
+    if error := mesh_error(model):
+        factors = error.factors(nodes, in_map.world_from_object.scale)
+        in_map, keyframes = with_mesh_error(in_map, keyframes, factors)
+        warnings += (error.warning,)
     if scene.is_metric and not same_size(found.world_from_object.scale):
         warnings += (OtherSize(found.world_from_object.scale),)
     if region is not None and found.ambiguous:
         warnings += (OnlyInBox(region[0]),)
-    placed = registration_in_map(model, in_map, _keyframes(found, views), facts, warnings, found.axis, scene)
+    placed = registration_in_map(model, in_map, keyframes, facts, warnings, found.axis, scene)
     return replace(placed, rivals=found.rivals)
 
 
@@ -331,10 +337,13 @@ def draw_registration(registration: Registration, scene: Scene) -> NDArray[np.ui
     assert registration.map_registration is not None
     model = registration.model
     nodes = model.positions(model.default)
-    world = registration.map_registration.world_from_object.apply(nodes)
+    placed = registration.map_registration.world_from_object
+    world = placed.apply(nodes)
     height = 1e3 * nodes[:, 2]
     columns = []
-    for view in spread_views(points_and_views(scene)[1], N_PICTURES):
+    views = points_and_views(scene)[1]
+    views = views_of(nodes, placed, views, scene.camera, len(views)) or views
+    for view in views_apart(views, world.mean(axis=0), N_PICTURES, registration.frame):
         local = view.camera_from_world.apply(world)
         image = np.asarray(cv2.cvtColor(view.normalized, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
         drawn = draw_overlay(

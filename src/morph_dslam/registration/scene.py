@@ -106,6 +106,26 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
     return [views[index] for index in chosen]
 
 
+def views_apart(views: Sequence[View], point: Array, most: int, kept: int | None = None) -> list[View]:
+    """At most so many of the views, in their order, that look at a point from the most different sides.
+
+    Parameters
+    ----------
+    views : to choose from.
+    point : (3,) world.
+    most : how many.
+    kept : frame of the one that is chosen first, if it is among them.
+    """
+    centres = np.array([view.camera_from_world.inverse.translation for view in views]).reshape(-1, 3)
+    directions = (centres - point) / np.linalg.norm(centres - point, axis=1)[:, None]
+    chosen = [next((k for k, view in enumerate(views) if view.frame == kept), 0)] if views else []
+    while len(chosen) < min(most, len(views)):
+        nearest = (directions @ directions[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(nearest.argmin()))
+    return [views[k] for k in sorted(chosen)]
+
+
 class HasPose(Protocol):
     """What has a camera's pose in the map."""
 

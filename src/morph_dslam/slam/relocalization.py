@@ -3,7 +3,8 @@
 Keyframes are ranked by a bag of binary words, trained from the map itself (Sivic and Zisserman 2003; binary words as in
 Gálvez-López and Tardós 2012; clusters by k-majority, Grana et al. 2013). The points of the likeliest one and of those
 that share most points with it are matched with the image's corners; P3P in RANSAC gives a rough pose, which is believed
-only if the points are found where it has them. Before that the place is tried at which the camera was lost.
+only if the points are found where it has them, and if no other place explains the view about as well. Before that the
+place is tried at which the camera was lost.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from morph_dslam.slam.frame_images import (
     match_points,
 )
 from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS, PATCH_HALF
-from morph_dslam.slam.pose import PoseEstimate, find_pose, inside, project, refine_pose
+from morph_dslam.slam.pose import PoseEstimate, find_pose, inside, inverse, project, refine_pose, reprojection_errors
 from morph_dslam.slam.result import NoPose, SlamReason
-from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
+from morph_dslam.slam.rigid_map import GOOD, NOWHERE, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracker
 from morph_dslam.tracking.patches import spread_corners
 
@@ -126,11 +127,22 @@ GROUP, LEAST_SHARED = 4, 20
 #: Matches are nearer than this many bits, and clearly nearer than the second best.
 MOST_BITS, RATIO = 80, 0.95
 #: Matches that agree on a rough pose, within so many pixels.
-ROUGH_INLIERS, ROUGH_PX = 12, 6.0
+ROUGH_INLIERS, ROUGH_PX = 8, 6.0
 #: A pose is believed if this share of the group's points in view are found where it has them, most of these
 #: fit it, and their error is at most so many times the usual one, or this: repeated texture fits badly
 #: somewhere else, but beside all keyframes the map's own errors show.
 LEAST_SHARE, LEAST_FIT, MOST_ERROR_RATIO, MOST_ERROR_PX = 0.35, 0.7, 2.0, 2.0
+#: A place that is not where the camera was lost needs so many points, as in ORB-SLAM (Mur-Artal et al. 2015), or this
+#: share of those in view where the map has few.
+LEAST_ANEW, SHARE_ANEW = 50, 0.6
+#: Places that are looked for by the same keyframes.
+N_PLACES = 2
+#: Another place is one that has the points so far away. It looks alike with this share of the points of the best one.
+APART_PX, ALIKE = 20.0, 0.7
+#: A camera held by hand moves by no more than so many times the scene's distance in a second.
+MOST_DEPTHS_PER_S = 2.0
+#: A pose, and the points that support it.
+Found = tuple[PoseEstimate, Followed]
 
 
 @dataclass(frozen=True)
@@ -157,7 +169,7 @@ class Relocalizer:
         self.places = PlaceIndex(rigid_map)
         self._turn = 0
 
-    def find(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | NoPose:
+    def find(self, view: FrameView, tracker: Tracker) -> Found | NoPose:
         """The pose and the points that support it, or why there is none."""
         found = self._where_it_was(view, tracker)
         if found is not None:
@@ -167,23 +179,72 @@ class Relocalizer:
             return NoPose(SlamReason.LITTLE_TEXTURE, (len(corners.pixels),))
         self.places.update()
         for number in self._candidates(corners.descriptors):
-            found = self.locate(view, corners, self.group(number), tracker)
-            if found is not None:
-                return found
+            group = self.group(number)
+            places = self._places(group, view, corners, tracker)
+            if places:
+                places += self._places(self._lookalikes(group, corners), view, corners, tracker)
+                return self._chosen(places, view, tracker)
         return NoPose(SlamReason.NO_SIMILAR_KEYFRAME)
 
-    def _where_it_was(self, view: FrameView, tracker: Tracker) -> tuple[PoseEstimate, Followed] | None:
+    def _places(self, group: Indices, view: FrameView, corners: Corners, tracker: Tracker) -> list[Found]:
+        """Where the points of some keyframes say that the camera may be: the second explains other matches."""
+        points, distances = self._distances(group, corners)
+        places = []
+        for _ in range(N_PLACES if len(points) else 0):
+            rough = self._rough_pose(points, distances, corners)
+            if rough is None:
+                break
+            found = self._confirmed(group, view, rough.camera_from_world, tracker, anew=True)
+            if found is not None:
+                places.append(found)
+            pixels, _ = project(rough.camera_from_world, self._map.positions[points], self._intrinsics)
+            away = np.linalg.norm(corners.pixels[: len(distances), None] - pixels, axis=2)
+            distances[away < ROUGH_PX] = np.iinfo(distances.dtype).max
+        return places
+
+    def _lookalikes(self, group: Indices, corners: Corners) -> Indices:
+        """The group of the likeliest other keyframe; none if there is none."""
+        likeness = self.places.similarities(corners.descriptors)
+        likeness[group] = 0.0
+        return self.group(int(likeness.argmax())) if likeness.any() else group[:0]
+
+    def _chosen(self, places: list[Found], view: FrameView, tracker: Tracker) -> Found | NoPose:
+        """The place that explains a view best; if another one does so about as well, the one that is within reach."""
+        first, *others = sorted(places, key=lambda place: -len(place[1].ids))
+        least = ALIKE * len(first[1].ids)
+        rivals = [place for place in others if len(place[1].ids) > least and self._apart_px(first, place) > APART_PX]
+        if not rivals:
+            return first
+        near = [place for place in (first, *rivals) if self._is_within_reach(place, view, tracker)]
+        counts = (len(first[1].ids), len(rivals[0][1].ids))
+        return near[0] if len(near) == 1 else NoPose(SlamReason.TWO_PLACES, counts)
+
+    def _apart_px(self, first: Found, second: Found) -> float:
+        """How far apart two poses have the points of the first one, median."""
+        positions = self._map.positions[first[1].ids]
+        pixels, _ = project(first[0].camera_from_world, positions, self._intrinsics)
+        errors = reprojection_errors(second[0].camera_from_world, positions, pixels, self._intrinsics)
+        return float(np.median(errors))
+
+    def _is_within_reach(self, place: Found, view: FrameView, tracker: Tracker) -> bool:
+        """Whether a camera held by hand can have got there since it was lost."""
+        if not len(tracker.points.ids):
+            return False
+        pose = place[0].camera_from_world
+        depth = float(np.median(project(pose, self._map.positions[place[1].ids], self._intrinsics)[1]))
+        moved = np.linalg.norm(inverse(pose)[:3, 3] - inverse(tracker.camera_from_world)[:3, 3])
+        return bool(moved < MOST_DEPTHS_PER_S * depth * (view.timestamp - tracker.timestamp))
+
+    def _where_it_was(self, view: FrameView, tracker: Tracker) -> Found | None:
         """The pose if the camera is still near where it was lost: of places that look alike the likeliest."""
         if not len(tracker.points.ids):
             return None
         number = int(np.bincount(self._map.template_keyframe[tracker.points.ids]).argmax())
         return self._confirmed(self.group(number), view, tracker.camera_from_world, tracker)
 
-    def locate(
-        self, view: FrameView, corners: Corners, group: Indices, tracker: Tracker
-    ) -> tuple[PoseEstimate, Followed] | None:
+    def locate(self, view: FrameView, corners: Corners, group: Indices, tracker: Tracker) -> Found | None:
         """The pose by the points of some keyframes, and the points that support it; None if they do not."""
-        rough = self._rough_pose(group, corners)
+        rough = self._rough_pose(*self._distances(group, corners), corners)
         return None if rough is None else self._confirmed(group, view, rough.camera_from_world, tracker)
 
     def _candidates(self, descriptors: Descriptors) -> list[int]:
@@ -199,29 +260,40 @@ class Relocalizer:
         best = np.argsort(-shared, kind="stable")[:GROUP]
         return best[shared[best] >= LEAST_SHARED]
 
-    def _rough_pose(self, group: Indices, corners: Corners) -> PoseEstimate | None:
-        """The pose that matches of descriptors agree on."""
+    def _distances(self, group: Indices, corners: Corners) -> tuple[Indices, NDArray[np.uint16]]:
+        """The map points (p,) of some keyframes, and how many bits corners (c,) differ from them (c, p)."""
         keyframes = [self._map.keyframes[k] for k in group]
+        if not keyframes:
+            return NOWHERE.ids, np.empty((0, 0), dtype=np.uint16)
         ids = np.concatenate([keyframe.described_ids for keyframe in keyframes])
         described = np.concatenate([keyframe.descriptors for keyframe in keyframes])
         good = self._map.state[ids] == GOOD
         points, local = np.unique(ids[good], return_inverse=True)
-        distances = least_distances(corners.descriptors, corners.rows, described[good], local)
+        return points, least_distances(corners.descriptors, corners.rows, described[good], local)
+
+    def _rough_pose(self, points: Indices, distances: NDArray[np.uint16], corners: Corners) -> PoseEstimate | None:
+        """The pose that matches of descriptors agree on."""
         first, second = match_points(distances, RATIO, MOST_BITS)
         positions = self._map.positions[points[second]]
         return find_pose(positions, corners.pixels[first], self._intrinsics, ROUGH_PX, least=ROUGH_INLIERS)
 
     def _confirmed(
-        self, group: Indices, view: FrameView, pose: Array, tracker: Tracker
-    ) -> tuple[PoseEstimate, Followed] | None:
-        """The pose from all points of the group, found near a rough pose (4, 4); None if too few are."""
+        self, group: Indices, view: FrameView, pose: Array, tracker: Tracker, anew: bool = False
+    ) -> Found | None:
+        """The pose from all points of the group, found near a rough pose (4, 4); None if too few are.
+
+        ``anew`` : whether the camera may be anywhere.
+        """
         ids = np.unique(np.concatenate([self._map.good_in(k) for k in group]))
         guesses, _ = project(pose, self._map.positions[ids], self._intrinsics)
         views = tracker.views_of(group)
         seen = inside(guesses, view.normalized.shape, PATCH_HALF + 2) & tracker.is_similar_view(ids, pose, views)
         found = tracker.find(view.pyramid, Followed(ids[seen], guesses[seen]), pose, 2, views)
         refined = refine_pose(pose, self._map.positions[found.ids], found.pixels, self._intrinsics, inlier_px=INLIER_PX)
-        enough = max(LEAST_INLIERS, LEAST_FIT * len(found.ids), LEAST_SHARE * int(seen.sum()))
+        in_view = int(seen.sum())
+        enough = max(LEAST_INLIERS, LEAST_FIT * len(found.ids), LEAST_SHARE * in_view)
+        if anew:
+            enough = max(enough, min(LEAST_ANEW, SHARE_ANEW * in_view))
         most = max(MOST_ERROR_RATIO * self._map.usual_rms_px, MOST_ERROR_PX)
         if refined.inliers.sum() < enough or refined.rms_px > most:
             return None

@@ -51,6 +51,7 @@ class SlamReason(Enum):
     FEW_INLIERS = "only {} of {} map points agree on a pose"
     RIVAL_MOTIONS = "two parts of the scene move apart, and which of them stands still is ambiguous"
     NO_SIMILAR_KEYFRAME = "the view resembles no keyframe"
+    TWO_PLACES = "two places of the map look alike: one has {} points in this frame, the other {}"
 
 
 @dataclass(frozen=True)

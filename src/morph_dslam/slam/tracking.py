@@ -178,13 +178,14 @@ class Tracker:
     Attributes
     ----------
     camera_from_world : (4, 4) the newest pose.
+    timestamp : of the frame that was tracked last, seconds.
     points : what is followed.
     """
 
     def __init__(self, rigid_map: RigidMap, camera: Camera) -> None:
         self._map = rigid_map
         self._camera, self._intrinsics = camera, camera.intrinsics
-        self._motion, self._twist, self._time = np.eye(4), UNKNOWN_TWIST, -np.inf
+        self._motion, self._twist, self.timestamp = np.eye(4), UNKNOWN_TWIST, -np.inf
         self._templates, self._pyramids = Templates(self._intrinsics), dict[int, Pyramid]()
         self._views: FewViews | None = None
         self._astray = NOWHERE
@@ -230,7 +231,7 @@ class Tracker:
             result = self._attempt(view, predicted, levels)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
-                gap, self._time = view.timestamp - self._time, view.timestamp
+                gap, self.timestamp = view.timestamp - self.timestamp, view.timestamp
                 self._twist = twist_of(self._motion, gap) if 0.0 < gap < MOST_GAP_S else UNKNOWN_TWIST
                 result = replace(result, twist=self._twist)
                 self.camera_from_world = result.pose.camera_from_world

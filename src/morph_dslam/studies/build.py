@@ -36,7 +36,7 @@ from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
-from morph_dslam.studies.study import Study, load_study, study_file, study_mesh_notes
+from morph_dslam.studies.study import Study, load_study, study_file, study_mesh_deviation, study_mesh_notes
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 
 #: Fewer held-out solutions than these say nothing of the error.
@@ -138,6 +138,8 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         loads, model.certificate["unknown_loads"] = reduce_unknown_loads(chosen, chosen.unknown_loads, snapshots)
         model = replace(model, unknown_loads=loads)
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
+    if isinstance(chosen, SolidStudy) and (deviation := study_mesh_deviation(chosen, chosen.solid_mesh())):
+        model.certificate["mesh_deviation"] = deviation
     model.provenance.update(provenance(text, chosen, model))
     doubts = _unstrained(snapshots) or _doubtful(model)
     if isinstance(chosen, ExternalStudy):

@@ -16,7 +16,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.sections import explain
 from morph_dslam.io.text import read_toml
 from morph_dslam.meshing.mesh_files import load_mesh
-from morph_dslam.meshing.mesh_notes import file_notes
+from morph_dslam.meshing.mesh_notes import file_deviation, file_notes
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.set_sections import with_sets
@@ -110,6 +110,14 @@ def study_mesh_notes(study: SolidStudy | ShellStudy, mesh: Mesh) -> list[str]:
     if getattr(section, "file", None) is None:
         return []
     return file_notes(mesh, section.file, section.unit, getattr(section, "size", None))
+
+
+def study_mesh_deviation(study: SolidStudy | ShellStudy, mesh: Mesh) -> dict[str, float] | None:
+    """How far the ``mesh`` of a study is off the surface of its file (`file_deviation`)."""
+    section: Any = study.mesh
+    if getattr(section, "file", None) is None:
+        return None
+    return file_deviation(mesh, section.file, section.unit, getattr(section, "size", None))
 
 
 def _kind(content: Mapping[str, Any]) -> type[Study]:
