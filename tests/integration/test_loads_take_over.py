@@ -75,7 +75,7 @@ def test_the_load_of_the_study_is_found_where_unknown_loads_have_taken_over(pull
     stuck = estimator.estimate(points, pixels, ones, start, prior=known)
     assert stuck.state.parameters[0] > 0.0
     assert stuck.sigma_px < 0.1
-    measured = Measurement(pixels, every, every, ones)
+    measured = Measurement(pixels, pixels, every, every, ones)
     estimation = FrameEstimation(estimator, SimpleNamespace(points=points), TrackerOptions())  # type: ignore[arg-type]
     found = estimation.search_other_shapes(PoseHypothesis(stuck, every, measured, ones, known)).estimate
     assert found.cost < 0.9 * stuck.cost
