@@ -113,7 +113,7 @@ def test_table_and_summary_are_in_display_units(finished):
     assert rows[BLANK]["arch_mm"] == ""
     assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary, default=str))
     assert (summary["n_tracked"], summary["n_lost"]) == (6, 1)
-    assert any("1 of 7 frames were lost" in flag for flag in summary["flags"])
+    assert any("1 of 7 frames was lost" in flag for flag in summary["flags"])
     assert summary.keys() - code_words("run-folder") == set()
 
 
@@ -287,7 +287,7 @@ def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs,
     chosen = options(inputs, tmp_path / "run", first=24, last=24, reference_frame=20)
     summary = track(chosen)
     assert (summary["n_tracked"], summary["n_lost"]) == (0, 1)
-    assert summary["flags"][-1].startswith("1 of 1 frames were lost")
+    assert summary["flags"][-1].startswith("1 of 1 frames was lost")
     assert not load_run(tmp_path / "run").tracked.any()
     assert (tmp_path / "run" / "augmented.mp4").is_file()
 
