@@ -50,7 +50,9 @@ def studio(tmp_path_factory):
 
 def outside(around):
     """What lies around the project folder."""
-    files = [path for path in around.rglob("*") if not path.is_relative_to(around / "project")]
+    # The project itself is not walked through: uploads come and go there.
+    beside = [path for path in around.iterdir() if path.name != "project"]
+    files = [path for top in beside for path in (top, *top.rglob("*"))]
     return {path: path.read_bytes() for path in files if path.is_file()}
 
 
