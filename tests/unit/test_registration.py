@@ -15,7 +15,7 @@ from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.mesh import register_mesh
-from morph_dslam.registration.mesh_error import mesh_error, with_mesh_error
+from morph_dslam.registration.mesh_error import mesh_error_factors, mesh_off_surface, with_mesh_error
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -84,18 +84,18 @@ def test_the_stated_deviations_are_those_of_the_middle_of_the_object():
 def test_a_mesh_that_is_off_its_surface_makes_the_place_less_exact():
     """One that is 3 % smaller in volume is 1 % smaller, and so the object seems 1 % nearer."""
     tube = bent_tube()
-    assert mesh_error(tube) is None
+    assert mesh_off_surface(tube) is None
     model = replace(tube, certificate={**tube.certificate, "mesh_deviation": {"volume": -0.03, "mean_m": 2e-4}})
-    error, centre = mesh_error(model), model.nodes.mean(axis=0)
-    assert error is not None
-    assert error.warning == MeshOffSurface(-0.03, 2e-4)
-    assert read_warning(error.warning.content()) == error.warning
+    off, centre = mesh_off_surface(model), model.nodes.mean(axis=0)
+    assert off is not None
+    assert off == MeshOffSurface(-0.03, 2e-4)
+    assert read_warning(off.content()) == off
     pose = RigidTransform(rotation_exp(np.array([0.3, -0.4, 0.2])), np.array([0.05, -0.02, 0.6]))
     away, radius = np.linalg.norm(pose.apply(centre)), np.sqrt(np.trace(np.cov(model.nodes.T, bias=True)))
     expected = pytest.approx((np.hypot(0.01 * away, 2e-4), 2e-4 / radius))
     exact = MapRegistration(SimilarityTransform(2.0, np.eye(3), np.zeros(3)), centre, np.zeros((7, 7)))
     for view in (KeyframePose(3, pose), KeyframePose(3, pose, np.zeros((6, 6)), np.zeros((6, 8)))):
-        found, views = with_mesh_error(exact, [view], error.factors(model.nodes, 2.0))
+        found, views = with_mesh_error(exact, [view], mesh_error_factors(off, model.nodes, 2.0))
         assert registration_in_map(model, found, views, {}, ()).pose_deviations() == expected
     assert views[0].error_factors @ views[0].error_factors.T == pytest.approx(views[0].covariance)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,43 +15,26 @@ from morph_dslam.registration.registration import KeyframePose, MapRegistration
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class MeshError:
-    """How far a model's mesh is off the surface that it was made from, as the build measured it.
-
-    Attributes
-    ----------
-    volume : of the mesh over that of the surface, less one.
-    mean : distance between the two, metres.
-    """
-
-    volume: float
-    mean: float
-
-    @property
-    def warning(self) -> MeshOffSurface:
-        """For a reader of the registration."""
-        return MeshOffSurface(self.volume, self.mean)
-
-    def factors(self, nodes: Array, scale: float) -> Array:
-        """Standard deviations (7,) of log scale, rotation vector (rad) and translation (map units).
-
-        The object is taken for larger or nearer by the cube root of the volume, and the distance may be the same all
-        over the side that is seen, which shifts it, or opposite at its ends, which tilts it.
-
-        Parameters
-        ----------
-        nodes : (n, 3) of the undeformed mesh, metres.
-        scale : map units per metre.
-        """
-        radius = float(np.sqrt(np.mean(np.sum((nodes - nodes.mean(axis=0)) ** 2, axis=1))))
-        return np.array([abs(self.volume) / 3.0, *3 * [self.mean / radius], *3 * [scale * self.mean]])
-
-
-def mesh_error(model: ReducedModel) -> MeshError | None:
-    """What the model's file says of its mesh; None if it is not off."""
+def mesh_off_surface(model: ReducedModel) -> MeshOffSurface | None:
+    """How far a model's mesh is off the surface that it was made from, as its file says; None if it is not off."""
     found = model.certificate.get("mesh_deviation")
-    return found and MeshError(float(found["volume"]), float(found["mean_m"]))
+    return found and MeshOffSurface(float(found["volume"]), float(found["mean_m"]))
+
+
+def mesh_error_factors(off: MeshOffSurface, nodes: Array, scale: float) -> Array:
+    """Standard deviations (7,) of log scale, rotation vector (rad) and translation (map units).
+
+    The object is taken for larger or nearer by the cube root of the volume, and the distance may be the same all over
+    the side that is seen, which shifts it, or opposite at its ends, which tilts it.
+
+    Parameters
+    ----------
+    off : how far the mesh is off.
+    nodes : (n, 3) of the undeformed mesh, metres.
+    scale : map units per metre.
+    """
+    radius = float(np.sqrt(np.mean(np.sum((nodes - nodes.mean(axis=0)) ** 2, axis=1))))
+    return np.array([abs(off.volume) / 3.0, *3 * [off.mean / radius], *3 * [scale * off.mean]])
 
 
 def with_mesh_error(

@@ -30,7 +30,7 @@ from morph_dslam.registration.landmarks import (
     on_surface,
 )
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
-from morph_dslam.registration.mesh_error import mesh_error, with_mesh_error
+from morph_dslam.registration.mesh_error import mesh_error_factors, mesh_off_surface, with_mesh_error
 from morph_dslam.registration.messages import OnlyInBox, OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
@@ -111,10 +111,10 @@ def register(
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
     keyframes = _keyframes(found, views)
     warnings = found.warnings
-    if error := mesh_error(model):
-        factors = error.factors(nodes, in_map.world_from_object.scale)
+    if off := mesh_off_surface(model):
+        factors = mesh_error_factors(off, nodes, in_map.world_from_object.scale)
         in_map, keyframes = with_mesh_error(in_map, keyframes, factors)
-        warnings += (error.warning,)
+        warnings += (off,)
     if scene.is_metric and not same_size(found.world_from_object.scale):
         warnings += (OtherSize(found.world_from_object.scale),)
     if region is not None and found.ambiguous:

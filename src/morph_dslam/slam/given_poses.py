@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.geometry import cross_matrix
 from morph_dslam.io.trajectory import other_conventions
 from morph_dslam.slam.frame_images import FrameView
 from morph_dslam.slam.options import LEAST_CORRELATION, PATCH_HALF
@@ -106,8 +107,7 @@ class PoseCheck:
     def _miss(self, first: Array, second: Array, before: Array, after: Array) -> float:
         """Median distance in pixels; NaN between poses at the same place, which have no epipolar lines."""
         motion = inverse(second) @ first
-        x, y, z = motion[:3, 3]
-        essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ motion[:3, :3]
+        essential = cross_matrix(motion[:3, 3]) @ motion[:3, :3]
         if not np.abs(essential).max() > 0.0:
             return np.nan
         squared = epipolar_errors(essential, before, after, self._intrinsics)
