@@ -84,12 +84,16 @@ def test_result_file_has_the_documented_layout(finished):
         assert "points agree" in file["reason"].asstr()[BLANK]
         assert np.isnan(file["parameters"][BLANK]).all()
         assert file["parameter_std"][1].max() < 0.01
+        deviations = np.sqrt(np.diagonal(file["covariance"][:], axis1=1, axis2=2))
+        assert deviations[1] == pytest.approx(np.concatenate([file["parameter_std"][1], file["pose_std"][1]]))
+        assert np.isnan(file["covariance"][BLANK]).all()
         assert (file["n_inliers"][:BLANK] > 250).all()
         assert (file["timings_ms"][:, :-1].sum(axis=1) <= file["timings_ms"][:, -1]).all()
     states = {
         "camera_from_object": (7, 4, 4),
         "parameters": (7, 3),
         "parameter_std": (7, 3),
+        "covariance": (7, 9, 9),
         "at_bound": (7, 3),
         "pose_std": (7, 6),
     }

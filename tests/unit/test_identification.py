@@ -20,6 +20,7 @@ from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import FACTOR, identify
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints, load_points
+from morph_dslam.identification.prior import KnownValues
 from morph_dslam.identification.report import identification_lines, summarise
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
@@ -222,13 +223,15 @@ def test_what_pictures_have_told_counts_with_its_deviation() -> None:
     table = points_at([0.3] * 12, 0.02)
     alone = identify(table.model, [table], ["a"])["a"].value
     std = float(np.std(table.measured[:, 0] - table.places[:, 0])) / np.sqrt(48.0)
-    both = identify(table.model, [table], ["a"], prior={"a": (alone + 2.0 * std, std)})["a"].value
+    both = identify(table.model, [table], ["a"], prior=KnownValues.independent({"a": (alone + 2.0 * std, std)}))[
+        "a"
+    ].value
     assert both == pytest.approx(alone + std, abs=0.05 * std)
 
 
 def test_known_deviations_stay_without_measurements() -> None:
     known = {"a": (0.3, 0.05), "b": (0.6, 0.1)}
-    found = identify(plate(), [], ["a", "b"], prior=known)
+    found = identify(plate(), [], ["a", "b"], prior=KnownValues.independent(known))
     for name, (value, std) in known.items():
         assert found[name].value == pytest.approx(value, abs=1e-6)
         assert found[name].std == pytest.approx(std, rel=1e-4)
@@ -240,9 +243,21 @@ def test_known_deviations_stay_without_measurements() -> None:
 def test_a_known_deviation_stays_where_measurements_tell_nothing() -> None:
     """The points tell the shift alone."""
     table = points_at([0.3] * 6, 1e-3)
-    found = identify(table.model, [table], ["a", "b"], prior={"b": (0.6, 0.05)})
+    found = identify(table.model, [table], ["a", "b"], prior=KnownValues.independent({"b": (0.6, 0.05)}))
     assert found["b"].std == pytest.approx(0.05, rel=1e-3)
     assert found["a"].std < 1e-3
+
+
+def test_what_is_measured_of_one_parameter_tells_of_another_that_is_correlated_with_it() -> None:
+    """A Gaussian of a and b, of which a is measured: mean and variance of b by conditioning."""
+    table = points_at([0.3] * 12, 0.02)
+    alone = identify(table.model, [table], ["a"])["a"]
+    covariance = np.array([[0.02, -0.015], [-0.015, 0.03]]) ** 2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    prior = KnownValues(("a", "b"), np.array([0.31, 0.6]), covariance)
+    found = identify(table.model, [table], ["b", "a"], prior=prior)
+    gain = covariance[0, 1] / (covariance[0, 0] + alone.std**2)
+    assert found["b"].value - 0.6 == pytest.approx(gain * (alone.value - 0.31), rel=0.05)
+    assert found["b"].std == pytest.approx(np.sqrt(covariance[1, 1] - gain * covariance[0, 1]), rel=0.02)
 
 
 def test_a_point_beside_the_surface_is_carried_as_a_rigid_body() -> None:
@@ -371,13 +386,22 @@ def test_a_given_sign_holds_where_that_of_the_force_depends_on_what_is_identifie
 STROKES = np.linspace(0.1, 0.9, 9)
 
 
-def write_run_of_plate(folder: Path, constants: dict[str, float] | None = None) -> None:
-    """A run that found the shift of each frame, and that b is 0.5 in all of them, say, known to 0.01."""
+def write_run_of_plate(
+    folder: Path, constants: dict[str, float] | None = None, correlation: float | None = None
+) -> None:
+    """A run that found the shift of each frame, and that b is 0.5 in all of them, say, known to 0.01.
+
+    With a correlation of b and c its covariances are kept.
+    """
     write_run(folder, frames=np.arange(9))
     save_model(folder / "model.morph", plate())
     with h5py.File(folder / "result.h5", "r+") as file:
         del file["parameters"]
         file["parameters"] = np.column_stack([STROKES, np.full(9, 0.5), np.full(9, 0.5)])
+        if correlation is not None:
+            covariance = np.diag(np.full(9, 1e-4))
+            covariance[1, 2] = covariance[2, 1] = 1e-4 * correlation
+            file["covariance"] = np.tile(covariance, (9, 1, 1))
     values = {"b": 0.5} if constants is None else constants
     found = [{"name": n, "value": v, "standard_deviation": 0.01, "observable": True} for n, v in values.items()]
     (folder / "summary.json").write_text(json.dumps({"one_over_the_sequence": found}))
@@ -415,6 +439,16 @@ def test_a_run_alone_gives_its_own_values(tmp_path: Path) -> None:
     b, c = values_by(tmp_path)
     assert (b["value"], c["value"]) == pytest.approx((0.5, 0.7), abs=1e-6)
     assert (b["standard_deviation"], c["standard_deviation"]) == pytest.approx((0.01, 0.01), rel=1e-3)
+
+
+def test_a_runs_values_keep_their_correlation(tmp_path: Path) -> None:
+    """Forces that tell nothing of b and c change nothing in what the run knows of them."""
+    write_run_of_plate(tmp_path / "run", {"b": 0.5, "c": 0.7}, correlation=-0.9)
+    (tmp_path / "curve.csv").write_text("a_1,force_N\n" + "".join(f"{a},{100 * a + a % 0.2}\n" for a in STROKES))
+    b, c = values_by(tmp_path, "--force", str(tmp_path / "curve.csv"), "--reaction", "edge:z")
+    assert (b["standard_deviation"], c["standard_deviation"]) == pytest.approx((0.01, 0.01), rel=1e-3)
+    correlation = json.loads((tmp_path / "out" / "identification.json").read_text())["correlation"]
+    assert correlation["b"]["c"] == pytest.approx(-0.9, abs=1e-3)
 
 
 def test_the_unknown_correlation_of_a_runs_values_narrows_nothing(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Identify and print the estimates."""
     from morph_dslam import load_model, load_run
     from morph_dslam.extend.identification import (
+        KnownValues,
         identification_lines,
         identify,
         last_line,
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     _check_once([(path.resolve(),) for path in arguments.points])
     points = [load_points(path, model, arguments.align_points) for path in arguments.points]
     forces = _forces(arguments, model, tracked)
-    prior, notes = dict[str, tuple[float, float]](), list[str]()
+    prior, notes = KnownValues.none(), list[str]()
     if folder is not None and tracked is not None:
         prior, notes = values_of_run(folder, tracked, arguments.parameter, bool(points or forces))
     found = identify(model, [*points, *forces], arguments.parameter, arguments.moduli, prior)
@@ -73,7 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
     for line in [*identification_lines(figures), *notes]:
         print(line)
     by_frame = any(each.curve.against == "frame" for each in forces)
-    if tracked is not None and not (by_frame or prior or notes):
+    if tracked is not None and not (by_frame or prior.names or notes):
         print(
             "note: --run changes nothing here: no forces are given by frame, and no parameter to identify is one that "
             "the run found for its whole sequence"

@@ -44,6 +44,8 @@ class Run:
     parameters : (f, d), SI.
     stage_times : (f,) milliseconds by stage name.
     discrepancies : what the shapes have beyond the model's, by row; empty where it was not looked for.
+    covariances : (f, d + 6, d + 6) of parameters, rotation vector and translation, SI, NaN where not tracked; None of
+        a run that has not kept them.
     """
 
     model: ReducedModel
@@ -55,6 +57,7 @@ class Run:
     parameters: Array
     stage_times: dict[str, Array]
     discrepancies: dict[int, Discrepancy] = field(default_factory=dict)
+    covariances: Array | None = None
 
     @classmethod
     def of(cls, camera: Camera, results: Mapping[int, FrameResult]) -> Run:
@@ -83,6 +86,7 @@ class Run:
             parameters=np.array([_parameters(result) for result in found]),
             stage_times={"total": np.array([result.total_ms for result in found])},
             discrepancies={row: r.discrepancy for row, r in enumerate(found) if r.discrepancy is not None},
+            covariances=np.array([_covariance(result) for result in found]),
         )
 
     @property
@@ -114,6 +118,12 @@ def _parameters(result: FrameResult) -> Array:
     """(d,), NaN where lost."""
     lost = np.full(len(result.model.parameters), np.nan)
     return lost if result.estimate is None else result.estimate.state.parameters
+
+
+def _covariance(result: FrameResult) -> Array:
+    """(d + 6, d + 6), NaN where lost."""
+    lost = np.full((len(result.model.parameters) + 6,) * 2, np.nan)
+    return lost if result.estimate is None else result.estimate.covariance
 
 
 def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
@@ -155,6 +165,7 @@ def load_run(folder: str | Path) -> Run:
                 parameters=parameters,
                 stage_times=dict(zip(names, np.asarray(file["timings_ms"]).T, strict=True)),
                 discrepancies=load_discrepancies(file),
+                covariances=np.asarray(file["covariance"]).astype(float) if "covariance" in file else None,
             )
     except EvaluationError:
         raise

@@ -13,6 +13,7 @@ from morph_dslam.identification.measurements import (
     Measurement as Measurement,
     load_points as load_points,
 )
+from morph_dslam.identification.prior import KnownValues as KnownValues
 from morph_dslam.identification.report import (
     identification_lines as identification_lines,
     last_line as last_line,

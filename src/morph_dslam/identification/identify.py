@@ -20,6 +20,7 @@ from scipy.stats import norm, qmc, t
 from morph_dslam.errors import IdentificationError
 from morph_dslam.identification.doubts import check_size, root_mean_square
 from morph_dslam.identification.measurements import MeasuredForces, Measurement
+from morph_dslam.identification.prior import KnownValues
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 
@@ -153,7 +154,7 @@ def identify(
     measurements: Sequence[Measurement],
     parameters: Sequence[str] = (),
     moduli: bool = False,
-    prior: Mapping[str, tuple[float, float]] | None = None,
+    prior: KnownValues | None = None,
 ) -> Identification:
     """The parameters for which the model predicts the measurements best.
 
@@ -164,7 +165,7 @@ def identify(
     parameters : names of those to identify.
     moduli : whether a common factor of all moduli is identified too: it scales the forces, and changes no shape of a
         body that is moved by its supports alone.
-    prior : value and standard deviation, SI, of parameters that are known already, as from pictures.
+    prior : of parameters that are known already, as from pictures; those that are not identified do not count.
 
     Raises
     ------
@@ -175,9 +176,10 @@ def identify(
         If the force that fits best falls where the measured one grows: it is that in the opposite direction.
     """
     unknowns = _unknowns(model, parameters, moduli)
-    if not measurements and not prior:
+    prior = prior or KnownValues.none()
+    if not measurements and not prior.names:
         raise IdentificationError("nothing was measured: give points or forces")
-    fit = _Fit(model, unknowns, measurements, prior or {})
+    fit = _Fit(model, unknowns, measurements, prior)
     found = fit.result(fit.best())
     for misfit in found.misfits:
         # Only now, for the sign of a force may depend on what is identified.
@@ -206,11 +208,13 @@ class _Fit:
         model: ReducedModel,
         unknowns: Sequence[Parameter],
         measurements: Sequence[Measurement],
-        prior: Mapping[str, tuple[float, float]],
+        prior: KnownValues,
     ) -> None:
         self._model, self._unknowns, self._measurements = model, list(unknowns), list(measurements)
         names = [parameter.name for parameter in unknowns]
-        self._prior = [(names.index(name), value, std) for name, (value, std) in prior.items() if name in names]
+        self._prior = prior.of(names)
+        self._is_known = np.array([names.index(name) for name in self._prior.names], dtype=np.int64)
+        self._whitening = self._prior.whitening()
         # A factor that may be a hundredth or a hundred is looked for by its logarithm.
         self._log = np.array([p.name == FACTOR for p in unknowns])
         ends = np.array([(p.lower, p.upper) for p in unknowns])
@@ -225,7 +229,7 @@ class _Fit:
             start = parts[-1].max() + 1 if parts else 0
             parts.append(np.unique(measurement.groups, return_inverse=True)[1] + start)
         start = parts[-1].max() + 1 if parts else 0
-        return np.concatenate([*parts, start + np.arange(len(self._prior))])
+        return np.concatenate([*parts, start + np.arange(len(self._is_known))])
 
     def _si(self, theta: Array) -> Array:
         inner = self._ends[:, 0] + theta * np.diff(self._ends, axis=1)[:, 0]
@@ -246,8 +250,8 @@ class _Fit:
     def _residuals(self, theta: Array) -> Array:
         """What was known before comes last."""
         parts = [missed / noise for missed, noise in zip(self._missed(theta), self._noise, strict=True)]
-        values = self._si(theta)
-        return np.concatenate([*parts, [(values[i] - value) / std for i, value, std in self._prior]])
+        away = self._si(theta)[self._is_known] - self._prior.values
+        return np.concatenate([*parts, self._whitening @ away])
 
     def best(self) -> Array:
         """The unknowns that fit best, over their ranges; measurements are weighted by what they are missed by."""

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import AT_THE_END
+from morph_dslam.identification.prior import KnownValues
 from morph_dslam.model import Parameter
 
+Array = NDArray[np.float64]
 
-def values_of_run(
-    folder: Path, run: Run, names: Collection[str], measured: bool
-) -> tuple[dict[str, tuple[float, float]], list[str]]:
-    """Value and standard deviation, SI, of the parameters to identify, and notes on those that do not count.
 
-    A run keeps no correlation of them. Of k parameters each deviation is multiplied by sqrt(k): k times the diagonal
-    of a covariance is never less than the covariance, whatever the correlation.
+def values_of_run(folder: Path, run: Run, names: Collection[str], measured: bool) -> tuple[KnownValues, list[str]]:
+    """What a run found of the parameters to identify, and notes on what does not count.
 
     Parameters
     ----------
@@ -44,12 +43,28 @@ def values_of_run(
             "build the model with a wider range, or give points or forces"
         )
     if ends:
-        return {}, [f"note: what the run found for its whole sequence does not count: {' and '.join(ends)}"]
-    wider, scale = float(np.sqrt(len(taken))) if measured else 1.0, {n: p.display(1.0) for n, p in of_model.items()}
-    return {
-        each["name"]: (each["value"] / scale[each["name"]], wider * each["standard_deviation"] / scale[each["name"]])
-        for each in taken
-    }, []
+        return KnownValues.none(), [
+            f"note: what the run found for its whole sequence does not count: {' and '.join(ends)}"
+        ]
+    scale = np.array([of_model[each["name"]].display(1.0) for each in taken])
+    values, std = (np.array([each[key] for each in taken]) / scale for key in ("value", "standard_deviation"))
+    kept = tuple(each["name"] for each in taken)
+    return KnownValues(kept, values, np.outer(std, std) * _correlation(run, kept, measured)), []
+
+
+def _correlation(run: Run, names: Sequence[str], measured: bool) -> Array:
+    """(k, k) of what the last tracked frame tells of parameters.
+
+    Of a run that has not kept any it is k times the identity where something else was ``measured``: that is never less
+    than a correlation, whatever it is.
+    """
+    if run.covariances is None or not run.tracked.any():
+        return (len(names) if measured else 1) * np.eye(len(names))
+    every = [parameter.name for parameter in run.model.parameters]
+    rows = [every.index(name) for name in names]
+    covariance = run.covariances[np.flatnonzero(run.tracked)[-1]][np.ix_(rows, rows)]
+    std = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
 
 
 def _at_the_end(parameter: Parameter | None, value: float) -> str | None:

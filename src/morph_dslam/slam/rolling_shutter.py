@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
+from morph_dslam.geometry import rotation_log
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.options import INLIER_PX, LEAST_INLIERS
 from morph_dslam.slam.pose import inverse, refine_pose
@@ -49,7 +50,8 @@ def velocities(timestamps: Array, camera_from_world: Array) -> Array:
 
 def twist_of(moved: Array, seconds: float) -> Array:
     """The velocity (6,) of a motion (4, 4), from the left, in some time: rotation vector, then translation."""
-    return np.concatenate([Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]]) / seconds
+    turn = rotation_log(np.ascontiguousarray(moved[:3, :3]))
+    return np.concatenate([turn, moved[:3, 3]]) / seconds
 
 
 def row_times(rows: Array, camera: Camera) -> Array:

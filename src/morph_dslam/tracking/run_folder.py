@@ -152,6 +152,7 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["pose_from"] = np.array([result.pose_from for result in run.results], dtype=text)
         file["pose_std"] = run.pose_std()
         file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
+        file.create_dataset("covariance", data=run.covariances(), compression="gzip")
         file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
         if run.model.stresses:
             file["largest_von_mises"], file["largest_von_mises_std"] = run.largest_stresses().T

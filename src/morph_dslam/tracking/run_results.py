@@ -95,6 +95,11 @@ class RunResults:
         """(f, d), SI, NaN where lost."""
         return self._of_estimates(lambda estimate: estimate.parameter_std, np.nan)
 
+    def covariances(self) -> Array:
+        """(f, d + 6, d + 6) of parameters, rotation vector and translation, SI, NaN where lost."""
+        lost = np.full((len(self.model.parameters) + 6,) * 2, np.nan)
+        return np.array([lost if r.estimate is None else r.estimate.covariance for r in self.results])
+
     def stated_std(self) -> Array:
         """(f, d), SI, of the parameters before the residuals widen them, NaN where lost."""
         return self._of_estimates(lambda estimate: estimate.stated_std, np.nan)
