@@ -6,10 +6,14 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.cli.track import print_summary
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.model_errors import ModelDeviation
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
@@ -25,6 +29,30 @@ CORNER = ("corner", (0.210, 0.1485, 0.0))
 #: Of arch (m), skew and twist (rad): correlated, and a pose that has no part in it.
 ROOT = np.array([[1e-3, 0.0, 0.0], [0.02, 0.05, 0.0], [0.01, 0.0, 0.02]])
 STATE = np.array([0.04, 0.3, 0.1])
+
+
+#: Cells along the strip.
+STRIP_CELLS = 40
+
+
+def rolled_strip_model(length):
+    """A strip along x that one parameter, an angle, rolls to an arc in the plane of x and z; interpolated exactly."""
+    across = np.array([-0.01, 0.01])
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0.0, length, STRIP_CELLS + 1), across, indexing="ij"))
+    nodes = np.column_stack([x, y, np.zeros_like(x)])
+    first = 2 * np.arange(STRIP_CELLS)[:, None]
+    triangles = np.concatenate([np.add(first, [0, 2, 1]), np.add(first, [1, 2, 3])])
+    angles = np.cos(np.pi * (np.arange(12) + 0.5) / 12) + 1.0  # Chebyshev's points of the range from 0 to 2
+    arcs = []
+    for angle in angles:
+        turned = angle * x / length
+        arcs.append(
+            np.column_stack([np.sin(turned) * length / angle, y, (1 - np.cos(turned)) * length / angle]) - nodes
+        )
+    coefficients = np.polynomial.chebyshev.chebfit(angles - 1.0, np.reshape(arcs, (12, -1)), 11)
+    functions = ParameterFunctions(np.zeros(1), np.full(1, 2.0), np.arange(12)[:, None], np.eye(12))
+    field = SeparatedField(coefficients.reshape(12, -1, 3), functions)
+    return ReducedModel("strip", nodes, triangles, (Parameter("angle", "angle", "rad", 0.0, 2.0, 1.0),), field)
 
 
 def in_frame(model, parameters, covariance):
@@ -86,6 +114,53 @@ def test_unknown_parameters_leave_a_displacement_open():
     assert np.isinf([*found.std, found.size_std]).all()
 
 
+def test_a_strip_that_is_rolled_up_turns_by_its_angle():
+    """A strip of length L rolled to an arc of angle a about y: at its end the surroundings have turned by -a."""
+    length, angle_std = 0.2, 0.02
+    model, angle = rolled_strip_model(length), 1.2
+    places = [("clamp", (0.0, 0.0, 0.0)), ("end", (length, 0.0, 0.0))]
+    run = run_of(model, places, in_frame(model, [angle], np.array([[angle_std**2]])))
+    clamp, end = (run.point_turns()[name][0] for name in ("clamp", "end"))
+    # Over the cells beside the end the mean turn is half a cell's less.
+    assert end.value == pytest.approx([0.0, -angle, 0.0], abs=0.51 * angle / STRIP_CELLS)
+    assert end.std[1] == pytest.approx(angle_std, rel=0.52 / STRIP_CELLS)
+    assert (end.std[0], end.std[2]) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert (end.size, end.size_std) == pytest.approx((abs(end.value[1]), end.std[1]))
+    assert clamp.size == pytest.approx(0.0, abs=0.51 * angle / STRIP_CELLS)
+
+
+def test_rotations_and_their_deviations_are_those_of_another_library():
+    """scipy's fit of the rotation to the corner's neighbours, and its finite differences."""
+    result = in_frame(MODEL, STATE, ROOT @ ROOT.T)
+    (found,) = run_of(MODEL, [CORNER], result).point_turns()["corner"]
+    corner = int(np.linalg.norm(MODEL.nodes - CORNER[1], axis=1).argmin())
+    nodes = np.unique(MODEL.triangles[(MODEL.triangles == corner).any(axis=1)])
+
+    def turn(parameters):
+        moved, rest = MODEL.positions(parameters)[nodes], MODEL.nodes[nodes]
+        return Rotation.align_vectors(moved - moved.mean(axis=0), rest - rest.mean(axis=0))[0]
+
+    np.testing.assert_allclose(found.value, turn(STATE).as_rotvec(), atol=1e-9)
+    step, here = 1e-5, turn(STATE)
+    slopes = [
+        ((turn(STATE + change) * here.inv()).as_rotvec() - (turn(STATE - change) * here.inv()).as_rotvec()) / (2 * step)
+        for change in step * np.eye(3)
+    ]
+    covariance = np.transpose(slopes) @ ROOT @ ROOT.T @ slopes
+    np.testing.assert_allclose(found.std, np.sqrt(np.diag(covariance)), rtol=1e-5)
+
+
+def test_the_models_own_error_is_in_a_rotations_deviation():
+    """A body that is turned by w about each axis is displaced by sqrt(2) w times its radius of gyration."""
+    exact = in_frame(MODEL, STATE, np.zeros((3, 3)))
+    wrong = replace(exact.estimate, by_model=ModelDeviation(np.zeros((3, 3)), 1e-3))
+    (found,) = run_of(MODEL, [CORNER], replace(exact, estimate=wrong)).point_turns()["corner"]
+    away = MODEL.nodes - MODEL.nodes.mean(axis=0)
+    about = [Rotation.from_rotvec(1e-6 * axis).apply(away) - away for axis in np.eye(3)]
+    displaced = np.sqrt(np.mean([np.sum(np.square(about), axis=(0, 2))]))
+    np.testing.assert_allclose(found.std, 1e-3 * 1e-6 / displaced, rtol=1e-3)
+
+
 def test_table_file_summary_and_plot_have_each_point(tmp_path, capsys):
     small = in_frame(MODEL, 0.5 * STATE, ROOT @ ROOT.T)
     places = [CORNER, ("middle", (0.0, 0.0, 0.0))]
@@ -94,7 +169,10 @@ def test_table_file_summary_and_plot_have_each_point(tmp_path, capsys):
     rows = list(csv.DictReader((tmp_path / "frames.csv").read_text().splitlines()))
     kinds = [f"{axis}{std}_mm" for std in ("", "_std") for axis in "xyz"]
     names = [f"displacement_{name}_{kind}" for name in ("corner", "middle") for kind in kinds]
-    assert list(rows[0])[-12:] == names
+    assert set(names) < set(rows[0])
+    assert [title for title in rows[0] if title.startswith("rotation_corner_")] == [
+        f"rotation_corner_{axis}{std}_deg" for std in ("", "_std") for axis in "xyz"
+    ]
     assert [rows[2][name] for name in names] == [""] * 12
     # The middle of the sheet goes up by the arch alone.
     assert float(rows[1]["displacement_middle_z_mm"]) == pytest.approx(40.0, abs=1e-3)
@@ -103,14 +181,19 @@ def test_table_file_summary_and_plot_have_each_point(tmp_path, capsys):
     with h5py.File(tmp_path / "result.h5") as file:
         np.testing.assert_allclose(file["points/corner/rest"], CORNER[1], atol=1e-12)
         values, deviations = file["points/middle/displacement"][()], file["points/middle/displacement_std"][()]
+        turns = file["points/corner/rotation"][()]
     np.testing.assert_allclose(values[:2, 2], [0.02, 0.04], atol=1e-12)
     np.testing.assert_allclose(deviations[:2, 2], 1e-3, rtol=1e-9)
-    assert np.isnan([values[2], deviations[2]]).all()
+    assert np.isnan([values[2], deviations[2], turns[2]]).all()
+    size = float(np.degrees(np.linalg.norm(turns[1])))
+    assert summarise(run)["points"][0]["rotation_deg"] == pytest.approx(size)
     summary = summarise(run)
     middle = summary["points"][1]
     assert (middle["name"], middle["at_mm"], middle["frame"]) == ("middle", pytest.approx([0.0] * 3, abs=1e-9), 1)
     print_summary(tmp_path, summary)
-    assert "largest displacement of 'middle': 40 ± 1 mm in frame 1\n" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "largest displacement of 'middle': 40 ± 1 mm in frame 1\n" in said
+    assert "largest rotation of 'corner': " in said
     plot_points(tmp_path / "points.png", run)
     assert (tmp_path / "points.png").stat().st_size > 1000
 

@@ -180,6 +180,10 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
         if "frame" in figures:
             line = "largest displacement of '{name}': {displacement_mm:.4g} ± {standard_deviation_mm:.2g} mm in frame "
             print((line + "{frame}").format(**figures))
+            line = (
+                "largest rotation of '{name}': {rotation_deg:.4g} ± {rotation_standard_deviation_deg:.2g} degrees in "
+            )
+            print((line + "frame {rotation_frame}").format(**figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
     if "live" in summary:

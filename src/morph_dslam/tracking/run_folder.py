@@ -176,12 +176,14 @@ def _write_reactions(file: h5py.File, run: RunResults) -> None:
 
 
 def _write_points(file: h5py.File, run: RunResults) -> None:
-    """``points/NAME/rest`` (3,), ``displacement`` and ``displacement_std`` (f, 3), NaN where hidden or lost."""
+    """``points/NAME/rest`` (3,), ``displacement``, ``rotation`` and their ``_std`` (f, 3), NaN where hidden or lost."""
+    turns = run.point_turns()
     for k, (name, frames) in enumerate(run.point_displacements().items()):
         assert run.points is not None
-        parts = np.array([_with_deviations(one) for one in frames])
         file[f"points/{name}/rest"] = run.points.rest[k]
-        file[f"points/{name}/displacement"], file[f"points/{name}/displacement_std"] = parts[:, :3], parts[:, 3:]
+        for kind, vectors in (("displacement", frames), ("rotation", turns[name])):
+            parts = np.array([_with_deviations(one) for one in vectors])
+            file[f"points/{name}/{kind}"], file[f"points/{name}/{kind}_std"] = parts[:, :3], parts[:, 3:]
 
 
 def _with_deviations(vector: VectorEstimate | None) -> Array:
@@ -190,15 +192,20 @@ def _with_deviations(vector: VectorEstimate | None) -> Array:
 
 
 def _point_columns(run: RunResults) -> tuple[list[str], list[list[str]]]:
-    """Names of the columns with displacements of points, and what is in them in each frame, millimetres."""
+    """Names of the columns with displacements and rotations of points, and what is in them in each frame."""
     names: list[str] = []
     rows: list[list[str]] = [[] for _ in run.frames]
-    for point, frames in run.point_displacements().items():
-        names += [f"displacement_{point}_{axis}{std}_mm" for std in ("", "_std") for axis in "xyz"]
-        for row, vector in zip(rows, frames, strict=True):
-            millimetres = 1e3 * _with_deviations(vector)
-            row += ["" if np.isnan(v) else f"{v:.4f}" for v in millimetres[:3]]
-            row += ["" if np.isnan(v) else f"{v:.3g}" for v in millimetres[3:]]
+    turns = run.point_turns()
+    for point, moved in run.point_displacements().items():
+        for kind, unit, factor, frames in (
+            ("displacement", "mm", 1e3, moved),
+            ("rotation", "deg", np.degrees(1.0), turns[point]),
+        ):
+            names += [f"{kind}_{point}_{axis}{std}_{unit}" for std in ("", "_std") for axis in "xyz"]
+            for row, vector in zip(rows, frames, strict=True):
+                values = factor * _with_deviations(vector)
+                row += ["" if np.isnan(v) else f"{v:.4f}" for v in values[:3]]
+                row += ["" if np.isnan(v) else f"{v:.3g}" for v in values[3:]]
     return names, rows
 
 
@@ -311,18 +318,28 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
 
 
 def largest_of_points(run: RunResults) -> list[dict[str, Any]]:
-    """Of each named point its place, and its largest displacement with standard deviation and frame, millimetres."""
+    """Of each named point its place, and its largest displacement and rotation, millimetres and degrees."""
     found: list[dict[str, Any]] = []
-    for k, (name, frames) in enumerate(run.point_displacements().items()):
+    turns = run.point_turns()
+    for k, (name, moved) in enumerate(run.point_displacements().items()):
         assert run.points is not None
         figures: dict[str, Any] = {"name": name, "at_mm": (1e3 * run.points.rest[k]).tolist()}
-        known = [(vector, frame) for vector, frame in zip(frames, run.frames, strict=True) if vector is not None]
-        if known:
-            largest, frame = max(known, key=lambda one: one[0].size)
-            figures |= {"displacement_mm": 1e3 * largest.size, "standard_deviation_mm": 1e3 * largest.size_std}
-            figures["frame"] = frame
+        figures |= _largest(moved, run, 1e3, ("displacement_mm", "standard_deviation_mm", "frame"))
+        names = ("rotation_deg", "rotation_standard_deviation_deg", "rotation_frame")
+        figures |= _largest(turns[name], run, float(np.degrees(1.0)), names)
         found.append(figures)
     return found
+
+
+def _largest(
+    vectors: Sequence[VectorEstimate | None], run: RunResults, factor: float, names: tuple[str, str, str]
+) -> dict[str, Any]:
+    """The length, its deviation and the frame of the longest vector, by these names; nothing where there is none."""
+    known = [(vector, frame) for vector, frame in zip(vectors, run.frames, strict=True) if vector is not None]
+    if not known:
+        return {}
+    largest, frame = max(known, key=lambda one: one[0].size)
+    return dict(zip(names, (factor * largest.size, factor * largest.size_std, frame), strict=True))
 
 
 def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:

@@ -107,20 +107,25 @@ def plot_reactions(path: Path, run: RunResults) -> None:
 
 
 def plot_points(path: Path, run: RunResults) -> None:
-    """The displacement of each named point along x, y and z, each with a band of two standard deviations."""
-    displacements = run.point_displacements()
-    figure, all_axes = _rows(len(displacements), 1.9)
+    """Displacement and rotation of each named point about x, y and z, each with a band of two standard deviations."""
+    turns, rows = run.point_turns(), list[tuple[str, float, Sequence[VectorEstimate | None]]]()
+    for name, moved in run.point_displacements().items():
+        rows += [
+            (f"displacement of {name} [mm]", 1e3, moved),
+            (f"rotation of {name} [deg]", float(np.degrees(1.0)), turns[name]),
+        ]
+    figure, all_axes = _rows(len(rows), 1.9)
     lost = np.full(3, np.nan)
-    for axes, (name, frames) in zip(all_axes, displacements.items(), strict=True):
-        values = 1e3 * np.array([lost if one is None else one.value for one in frames])
-        deviations = 1e3 * np.array([lost if one is None else one.std for one in frames])
+    for axes, (label, factor, frames) in zip(all_axes, rows, strict=True):
+        values = factor * np.array([lost if one is None else one.value for one in frames])
+        deviations = factor * np.array([lost if one is None else one.std for one in frames])
         reach = 1.2 * float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
         for k, axis in enumerate("xyz"):
             low, high = (np.clip(values[:, k] + side * 2.0 * deviations[:, k], -reach, reach) for side in (-1.0, 1.0))
             axes.fill_between(run.frames, low, high, color=f"C{k}", alpha=0.25, linewidth=0)
             axes.plot(run.frames, values[:, k], color=f"C{k}", linewidth=1.4, label=axis)
         axes.set_ylim(-reach, reach)
-        axes.set_ylabel(f"displacement of {name} [mm]", fontsize=8)
+        axes.set_ylabel(label, fontsize=8)
         _shade_lost(axes, run)
     all_axes[0].legend(loc="upper left", fontsize=8, ncols=3, title="±2 standard deviations", title_fontsize=8)
     figure.savefig(path, dpi=DPI)

@@ -16,6 +16,7 @@ from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.observability import largest_displacement, largest_von_mises
 from morph_dslam.tracking.outcomes import Status
+from morph_dslam.tracking.point_rotations import Surroundings
 from morph_dslam.tracking.reactions import Reaction, Reactions, VectorEstimate
 from morph_dslam.tracking.result import STAGES, FrameResult
 
@@ -151,6 +152,21 @@ class RunResults:
         of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
         of_points += result.estimate.model_displacement**2 / 3.0 * np.eye(3)
         return [VectorEstimate.of(value, of_point) for value, of_point in zip(values, of_points, strict=True)]
+
+    def point_turns(self) -> dict[str, list[VectorEstimate | None]]:
+        """Of each named point the rotation vector of its surroundings in every frame, object frame, radians.
+
+        None where hidden or lost.
+        """
+        if self.points is None:
+            return {}
+        found = [None if r.estimate is None else self._around.turns(r.estimate, r.discrepancy) for r in self.results]
+        return {name: [None if row is None else row[k] for row in found] for k, name in enumerate(self.points.names)}
+
+    @cached_property
+    def _around(self) -> Surroundings:
+        assert self.points is not None
+        return Surroundings.of(self.model, self.points.points)
 
     @cached_property
     def _field_of_points(self) -> SeparatedField:
