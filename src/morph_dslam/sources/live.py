@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SourceError
 from morph_dslam.sources import frames as limits
 from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, open_capture
+from morph_dslam.sources.steady_times import SteadyTimes
 
 _LOG = logging.getLogger("morph_dslam")
 Item = TypeVar("Item")
@@ -141,7 +142,7 @@ class LiveStream:
 class LiveCamera(LiveStream):
     """A camera. Frames are numbered as they come, so a dropped frame leaves a gap.
 
-    Timestamps are seconds since the first frame.
+    Timestamps are seconds since the first frame, without the jitter of when frames come.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ class LiveCamera(LiveStream):
         self.start()
 
     def read(self) -> Iterator[Frame]:
-        index, start, now = 0, 0.0, 0.0
+        index, start, now, times = 0, 0.0, 0.0, SteadyTimes()
         while not self.closing:
             delivered, image = self._capture.read()
             if not delivered or image is None:
@@ -180,7 +181,7 @@ class LiveCamera(LiveStream):
             now = self._clock()
             start = now if index == 0 else start
             # Captures may hand out the same memory again.
-            yield Frame(index, now - start, np.array(image, dtype=np.uint8), captured=now)
+            yield Frame(index, times.add(now - start), np.array(image, dtype=np.uint8), captured=now)
             index += 1
 
     def _image_after_reconnection(self, last: float, what: str) -> NDArray | None:

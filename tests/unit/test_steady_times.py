@@ -1,0 +1,54 @@
+"""Times of frames against the true ones, which a receiver sees late by a random delay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morph_dslam.sources.steady_times import SteadyTimes
+
+
+def smoothed(received: np.ndarray) -> np.ndarray:
+    times = SteadyTimes()
+    return np.array([times.add(float(time)) for time in received])
+
+
+def received_at(true: np.ndarray, seed: int, late: float = 4e-3) -> np.ndarray:
+    """Each up to twice ``late`` seconds after the true time."""
+    return true + np.random.default_rng(seed).uniform(0.0, 2.0 * late, len(true))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("rate", [15.0, 30.0, 60.0])
+def test_intervals_are_those_of_the_camera(rate: float, seed: int) -> None:
+    true = np.arange(300) / rate
+    received = received_at(true, seed)
+    settled = slice(100, None)
+    jitter, left = (np.std(np.diff(times)[settled] - 1.0 / rate) for times in (received, smoothed(received)))
+    assert left < 0.25 * jitter
+    # The mean delay stays.
+    assert np.mean((smoothed(received) - true)[settled]) == pytest.approx(4e-3, abs=1.5e-3)
+
+
+def test_dropped_frames_leave_gaps() -> None:
+    true = np.delete(np.arange(300) / 30.0, [150, 200, 201, 202])
+    found = smoothed(received_at(true, 3))
+    gaps = np.diff(found)[[149, 198]]
+    assert gaps == pytest.approx([2.0 / 30.0, 4.0 / 30.0], abs=2e-3)
+
+
+def test_another_rate_is_followed() -> None:
+    """Automatic exposure in a dark room: from 30 frames a second to 24."""
+    true = np.concatenate([np.arange(200) / 30.0, 200 / 30.0 + np.arange(200) / 24.0])
+    found = smoothed(received_at(true, 4))
+    assert np.abs(found - true - 4e-3).max() < 0.5 / 24.0
+    assert np.std(np.diff(found)[-100:] - 1.0 / 24.0) < 1.5e-3
+
+
+def test_times_never_run_backwards() -> None:
+    """A camera on the network, whose frames come in bunches."""
+    true = np.arange(200) / 25.0
+    received = np.ceil(true / 0.2) * 0.2
+    assert (np.diff(smoothed(received)) >= 0.0).all()
+    received = np.array([0.0, 0.04, 0.08, 0.08, 0.08, 0.2])
+    assert (np.diff(smoothed(received)) >= 0.0).all()
