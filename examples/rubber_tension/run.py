@@ -270,6 +270,9 @@ def with_discs(name: str, specimen: Specimen, data: Path, model: Path) -> Compar
             print(
                 f"stroke: the clamp's, by the discs, scatters by {clamp:.4f} mm, the tracked one about it by {ours:.4f}"
             )
+            if found.crack is not None:
+                sound = stroke_line(run, found.crack - 1)["stroke_scatter_mm"]
+                print(f"stroke before frame {found.crack}, from which on a crack is named: scatters by {sound:.4f} mm")
     return found
 
 
