@@ -11,21 +11,48 @@ from numpy.typing import NDArray
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior
+from morph_dslam.tracking.displacement_jumps import DisplacementJump, largest_jump
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.outcomes import (
+    CameraLost,
     FewPointsAgree,
     ModelDoesNotExplain,
+    ObjectMoved,
+    OtherReferenceView,
     PoseSource,
     ReferenceWidened,
     Rejection,
     Status,
+    SurfaceJumps,
     TrackingWarning,
 )
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 from morph_dslam.tracking.views import ActiveView
+
+
+def warnings_of_place(
+    has_moved: bool, jumps: Sequence[DisplacementJump], view: int, why_lost: str
+) -> list[TrackingWarning]:
+    """What is to be said of where an object is, whether it is tracked or lost.
+
+    Parameters
+    ----------
+    has_moved : whether it has left its place in the map.
+    jumps : where its surface was found open.
+    view : number of the reference view, 0 for the first one.
+    why_lost : why the camera is lost; empty if it is not.
+    """
+    warnings: list[TrackingWarning] = [ObjectMoved()] if has_moved else []
+    if jumps:
+        warnings.append(SurfaceJumps(largest_jump(jumps).text))
+    if view:
+        warnings.append(OtherReferenceView(view))
+    if why_lost:
+        warnings.append(CameraLost(why_lost))
+    return warnings
 
 
 def lost_result(

@@ -415,3 +415,28 @@ class ReferenceView:
         if self.outline is not None:
             blocks.append(scipy.sparse.eye_array(len(self.outline.points)))
         return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+
+
+def first_view(
+    estimator: Estimator, images: Sequence[PosedImage], options: TrackerOptions, outline_too: bool
+) -> tuple[ReferenceView, TrackerOptions]:
+    """The reference view that tracking begins with, and the options with which it was made.
+
+    Parameters
+    ----------
+    outline_too : whether to use the outline, unasked, of an object that shows too little texture.
+
+    Raises
+    ------
+    RegistrationError
+        If the object shows too few corners, and its outline is not to be used.
+    """
+    try:
+        view = ReferenceView(estimator, images, options)
+        if options.use_outline or not outline_too or view.n_textured >= fewest_points(estimator.model):
+            return view, options
+    except RegistrationError as error:
+        if not outline_too or error.reason is not RegistrationFailure.FEW_CORNERS:
+            raise
+    options = replace(options, use_outline=True)
+    return ReferenceView(estimator, images, options), options

@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
@@ -24,7 +22,7 @@ from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
-from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector, largest_jump
+from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
 from morph_dslam.tracking.estimator import Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import (
     a_turn_back,
@@ -32,23 +30,21 @@ from morph_dslam.tracking.frame_estimation import (
     new_filter,
     with_unobservable_at_default,
 )
-from morph_dslam.tracking.frame_results import lost_result, pose_source, tracked_result, with_model_errors
+from morph_dslam.tracking.frame_results import (
+    lost_result,
+    pose_source,
+    tracked_result,
+    warnings_of_place,
+    with_model_errors,
+)
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import (
-    CameraLost,
-    FoundBy,
-    ObjectMoved,
-    OtherReferenceView,
-    Rejection,
-    SurfaceJumps,
-    TrackingWarning,
-)
-from morph_dslam.tracking.patches import LEVELS, follow, normalize_contrast, zero_where_unknown
-from morph_dslam.tracking.reference import PosedImage, ReferenceView, fewest_points
+from morph_dslam.tracking.outcomes import FoundBy, Rejection
+from morph_dslam.tracking.patches import LEVELS, follow, zero_where_unknown
+from morph_dslam.tracking.reference import PosedImage, ReferenceView, first_view
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.row_motion import StateHistory
@@ -167,7 +163,11 @@ class Tracker:
         self._last = self._velocity_base = self._start = registration.state
         self._jumps_before: tuple[DisplacementJump, ...] = ()
         if reference is not None:
-            self._begin(reference if isinstance(reference, Image) else self._prepared(Picture.of(reference, camera)))
+            self._begin(
+                reference
+                if isinstance(reference, Image)
+                else Picture.of(reference, camera).made_ready(self._undistortion)
+            )
 
     def track(
         self,
@@ -261,7 +261,7 @@ class Tracker:
         with stage("prepare"):
             picture = Picture.of(frame, self.camera, self.options.use_depth)
             motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
-            image = ready or self._prepared(picture)
+            image = ready or picture.made_ready(self._undistortion)
             image = replace(image, depth=picture.depth, occluder_depth=occluder_depth, motion=motion)
             if self._views is None:
                 self._begin(image)
@@ -393,7 +393,8 @@ class Tracker:
         self, hypothesis: PoseHypothesis, found_by: FoundBy, rejection: Rejection | None, camera: CameraLocalization
     ) -> FrameResult:
         """Status, estimate with all known errors in its covariance, and warnings."""
-        warnings = self._warnings_of_place(camera)
+        number, has_moved = self._view.number, self._anchoring.has_moved
+        warnings = warnings_of_place(has_moved, self.jumps, number, camera.why_lost)
         if rejection is not None:
             placed = self._placed_by_map(camera)
             result = lost_result(self.model, hypothesis, rejection, placed, warnings)
@@ -401,22 +402,11 @@ class Tracker:
             result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings)
             is_still = self.options.pose == "still"
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
-        number, modulus_std = self._view.number, self.options.modulus_std
-        return replace(result, view=number, motion=self._image.motion, modulus_std=modulus_std)
+        return replace(result, view=number, motion=self._image.motion, modulus_std=self.options.modulus_std)
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
         """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
         return None if self._anchoring.has_moved else camera.pose_prior
-
-    def _warnings_of_place(self, camera: CameraLocalization) -> list[TrackingWarning]:
-        warnings: list[TrackingWarning] = [ObjectMoved()] if self._anchoring.has_moved else []
-        if self.jumps:
-            warnings.append(SurfaceJumps(largest_jump(self.jumps).text))
-        if self._view.number:
-            warnings.append(OtherReferenceView(self._view.number))
-        if camera.why_lost:
-            warnings.append(CameraLost(camera.why_lost))
-        return warnings
 
     # -- reference views and state ------------------------------------------------------------------------
 
@@ -454,7 +444,10 @@ class Tracker:
         known = self._registration
         keyframes = self._keyframes or KeyframeViews(error_factors_of(known.covariance, self.estimator.scale))
         first = PosedImage(image, known.state, keyframes.error_factors, self._seen, known.discrepancy)
-        view, options = self._view_of([first, *keyframes.views]), self.options
+        # An object that the map has, but that shows no texture, is followed by its outline unasked.
+        in_map = known.map_registration is not None and self.options.pose != "free"
+        view, self.options = first_view(self.estimator, [first, *keyframes.views], self.options, in_map)
+        options = self.options
         if options.pose == "still":
             # Where there are points, their places on the mesh have this error too: `SystematicErrors` adds both.
             factors = keyframes.error_factors if view.outline_alone else None
@@ -467,26 +460,6 @@ class Tracker:
         self._image, self._pixels = image, view.pixels
         self._supported = np.ones(len(view.points), dtype=bool)
         self._beyond = known.discrepancy
-
-    def _view_of(self, images: Sequence[PosedImage]) -> ReferenceView:
-        """The reference view; of an object that the map has, but that shows no texture, the outline is used unasked."""
-        in_map = self._registration.map_registration is not None and self.options.pose != "free"
-        try:
-            view = ReferenceView(self.estimator, images, self.options)
-            if self.options.use_outline or not in_map or view.n_textured >= fewest_points(self.model):
-                return view
-        except RegistrationError as error:
-            if not in_map or error.reason is not RegistrationFailure.FEW_CORNERS:
-                raise
-        self.options = replace(self.options, use_outline=True)
-        return ReferenceView(self.estimator, images, self.options)
-
-    def _prepared(self, picture: Picture) -> Image:
-        grey = picture.grey
-        if self._undistortion is not None:
-            grey = cv2.remap(grey, *self._undistortion, interpolation=cv2.INTER_LINEAR)
-        normalized = normalize_contrast(grey)  # type: ignore[arg-type]
-        return Image(grey, normalized)  # type: ignore[arg-type]
 
     def _expected_motion(self, last: Array, prior: Prior | None) -> Array:
         """Image motion (p, 2) by the map, or at the velocity of two frames; only a first guess.

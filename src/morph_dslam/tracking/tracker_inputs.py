@@ -14,7 +14,9 @@ from morph_dslam.errors import ArgumentError, RegistrationError, SourceError, Tr
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NO_MAP, TrackerOptions
+from morph_dslam.tracking.patches import normalize_contrast
 
 #: Nodes that are farther apart than this share of the object's size belong to different meshes.
 OTHER_MESH = 1e-3
@@ -137,3 +139,10 @@ class Picture:
         if self.image.ndim == 2:
             return np.ascontiguousarray(self.image)
         return np.asarray(cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+    def made_ready(self, undistortion: tuple[NDArray[Any], NDArray[Any]] | None) -> Image:
+        """As trackers compare it: without distortion, by the camera's maps, and of even contrast."""
+        grey = self.grey
+        if undistortion is not None:
+            grey = np.asarray(cv2.remap(grey, *undistortion, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+        return Image(grey, normalize_contrast(grey))
