@@ -162,12 +162,10 @@ class Tracker:
         self._views: ViewSet | None = None
         self._last = self._velocity_base = self._start = registration.state
         self._jumps_before: tuple[DisplacementJump, ...] = ()
+        if reference is not None and not isinstance(reference, Image):
+            reference = Picture.of(reference, camera).made_ready(self._undistortion)
         if reference is not None:
-            self._begin(
-                reference
-                if isinstance(reference, Image)
-                else Picture.of(reference, camera).made_ready(self._undistortion)
-            )
+            self._begin(reference)
 
     def track(
         self,
