@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from morph_dslam import load_model
 from morph_dslam.cli import app as cli
@@ -41,8 +42,19 @@ held_out = 4
 EULER = 4.0 * np.pi**2 * 10.0**2 / (12.0 * 150.0**2)
 
 
-def test_a_bifurcation_that_was_passed_is_reported(tmp_path, capsys) -> None:
-    (tmp_path / "study.toml").write_text(COLUMN)
+#: A pressure on its sides alone, whose rims are held, and one on a face whose rim is free: the tangent is symmetric,
+#: and is not.
+PRESSURE = '[[loads]]\nkind = "pressure"\non = {on}\npressure = "{size} Pa"\n'
+SIDES, FACE = '["x_min", "x_max", "y_min", "y_max"]', '"part"'
+PART = '\n[sets.part]\nof = "x_max"\nbox = [["-1 mm", "-1 mm", "50 mm"], ["11 mm", "21 mm", "80 mm"]]\n'
+
+
+LOADS = {"none": "", "closed": PRESSURE.format(on=SIDES, size=100), "open": PART + PRESSURE.format(on=FACE, size=1)}
+
+
+@pytest.mark.parametrize("load", LOADS.values(), ids=LOADS)
+def test_a_bifurcation_that_was_passed_is_reported(tmp_path, capsys, load) -> None:
+    (tmp_path / "study.toml").write_text(COLUMN + load)
     assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "column.morph")]) == 0
     printed = capsys.readouterr().out
     report = load_model(tmp_path / "column.morph").certificate["stability"]

@@ -60,6 +60,17 @@ def test_solves_an_unsymmetric_matrix(engine) -> None:
     np.testing.assert_allclose(solution[free], np.linalg.solve(dense[np.ix_(free, free)], right[free]))
 
 
+def test_a_matrix_that_turns_out_to_be_symmetric_gives_its_inertia(engine) -> None:
+    """One solver, whose matrices are symmetric or not as the state has it."""
+    solver, right = LinearSolver(np.ones(30, dtype=bool), symmetric=False, engine=engine), np.arange(30.0)
+    for negative, skew in ((2, 0.0), (2, 1e-3), (0, 0.0)):
+        dense = random_symmetric(30, negative) + skew * np.triu(np.ones((30, 30)), 1)
+        matrix = sp.csr_matrix(dense)
+        found = solver.factorise(matrix.data, matrix.indices, matrix.indptr)
+        np.testing.assert_allclose(found.solve(right), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9)
+        assert found.negative_pivots == (None if skew else negative)
+
+
 def test_the_folder_is_not_searched_for_the_library_again(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pypardiso", reason="pypardiso is not installed")
     right, free = np.arange(3.0), np.ones(3, dtype=bool)

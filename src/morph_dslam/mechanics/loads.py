@@ -1,7 +1,7 @@
 """Loads on a solid or a shell, any of them a function of parameters.
 
-Dead loads have an energy; the follower pressure has none, and makes the tangent unsymmetric. All areas and volumes are
-those of the undeformed solid, whatever its shape parameters.
+Dead loads have an energy; the follower pressure has none, and makes the tangent unsymmetric unless its surface is
+closed or held at its rim. All areas and volumes are those of the undeformed solid, whatever its shape parameters.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ alike, as in the paper's "Cartesian mean error"; a value's size is the Euclidean
 norm of a tensor, neither of which depends on the axes.
 
 An equilibrium is stable under its prescribed supports where the tangent on the free degrees of freedom is positive
-definite; Sylvester's law of inertia counts its negative eigenvalues from the factorisation. Where the count differs
+definite; Sylvester's law of inertia counts its negative eigenvalues from the factorisation, and `stability` those of a
+tangent that is not symmetric. Where the count differs
 between two neighbours of the sweep, a critical point lies between them: a limit point, or a bifurcation.
 """
 
@@ -69,7 +70,7 @@ def stability_report(
 def stability_warnings(certificate: dict[str, Any]) -> list[str]:
     """Lines for whoever builds a model, on solutions that are known to be unstable, and on what was passed.
 
-    That the solver cannot tell, as under every follower pressure, the certificate says.
+    That the solver cannot tell, as of viscous bodies, the certificate says.
     """
     report = certificate.get("stability")
     if report is None or not report["unstable"] + len(report["passed"]):

@@ -22,6 +22,7 @@ from morph_dslam.mechanics.solvers.continuation import (
     refuse_passage,
 )
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
+from morph_dslam.mechanics.solvers.stability import unstable_directions
 from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sections import UnknownLoadsSection
@@ -182,7 +183,7 @@ class _SolidState:
     mu : (d,).
     dofs : (n,).
     slopes : (d, n) of the dofs by the parameters.
-    negative_pivots : of the tangent; None if they are not known.
+    negative_pivots : of the tangent, or the `unstable_directions`; None if they are not known.
     """
 
     mu: Array
@@ -255,7 +256,7 @@ class SolidSweep:
         tangent = self.problem.linearise(state.dofs, state.mu)
         slopes = sensitivities(self.problem, state, tangent)
         self._kept, self._solved = (state.mu, tangent), state.dofs
-        return _SolidState(state.mu, state.dofs, slopes, tangent.negative_pivots)
+        return _SolidState(state.mu, state.dofs, slopes, unstable_directions(self.problem, tangent))
 
     def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
         """See `unknown_loads.LoadableProblem`."""

@@ -46,6 +46,9 @@ PERTURBED_PIVOTS, NEGATIVE_EIGENVALUES = 14, 23
 LIBRARY_VARIABLE = "PYPARDISO_MKL_RT"
 #: Without PARDISO, negative eigenvalues are counted among so many nearest to zero.
 LOOKED_AT = 6
+#: A matrix is symmetric where it differs from its transpose by no more than this part of its largest entry: a follower
+#: pressure has an energy where its surface is closed or held at the rim.
+ASYMMETRY = 1e-12
 
 
 class Pardiso:
@@ -240,6 +243,10 @@ class _FreeBlock:
         return sp.csr_matrix((values, self.indices, self.indptr), shape=(size, size))
 
 
+def _is_symmetric(matrix: Matrix) -> bool:
+    return bool(abs(matrix - matrix.T).max() <= ASYMMETRY * abs(matrix).max()) if matrix.shape[0] else True
+
+
 def multiply(matrix: Matrix, vectors: Array, triangular: bool) -> Array:
     """Matrix times ``vectors`` (n,) or (n, k), of a symmetric matrix stored as one triangle if ``triangular``."""
     product = matrix @ vectors
@@ -378,7 +385,8 @@ class LinearSolver(TangentSolver):
     symmetric : see `TangentSolver`.
     threads : of PARDISO; None leaves MKL's own choice.
     engine : "pardiso" or "sparsecholesky"; None for `default_engine`. Unsymmetric matrices go to SuperLU where PARDISO
-        is not used, since `sparsecholesky` reads one triangle only.
+        is not used, since `sparsecholesky` reads one triangle only. A matrix that turns out to be symmetric is
+        factorised as such, which takes half the work and gives its inertia.
     all_free : see `TangentSolver`.
     """
 
@@ -391,10 +399,9 @@ class LinearSolver(TangentSolver):
         all_free: NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__(free, symmetric, all_free)
-        if (engine or default_engine()) == "pardiso":
-            self.engine: _Engine = Pardiso(symmetric, threads)
-        else:
-            self.engine = _SparseCholesky() if symmetric else SuperLU(triangular=False)
+        self._threads, self._engine_name = threads, engine or default_engine()
+        self._triangular = symmetric
+        self.engine = self._make_engine()
         self._block: _FreeBlock | None = None
         self._pattern: tuple[Integers, Integers] | None = None
         self._substitute: SuperLU | None = None
@@ -404,13 +411,23 @@ class LinearSolver(TangentSolver):
         """See `TangentSolver`."""
         if not np.all(np.isfinite(data)):
             raise SolverError("the tangent matrix is not finite: the deformation is too large or inside out")
-        block = self._block_of(indices, indptr)
-        matrix = block.extract(data)
+        matrix: Matrix = self._block_of(indices, indptr).extract(data)
+        triangular = self.symmetric or _is_symmetric(matrix)
+        if triangular and not self.symmetric:
+            matrix = sp.triu(matrix, format="csr")
+        if triangular != self._triangular:
+            self._triangular = triangular
+            self.engine = self._make_engine()
         self._substitute = None
         if matrix.shape[0]:
             self.engine.factorise(matrix)
-        self.latest = Factorisation(self, matrix, block.triangular)
+        self.latest = Factorisation(self, matrix, triangular)
         return self.latest
+
+    def _make_engine(self) -> _Engine:
+        if self._engine_name == "pardiso":
+            return Pardiso(self._triangular, self._threads)
+        return _SparseCholesky() if self._triangular else SuperLU(triangular=False)
 
     def _block_of(self, indices: Integers, indptr: Integers) -> _FreeBlock:
         """The free block's pattern, worked out again only when K's pattern has changed."""
@@ -428,7 +445,7 @@ class LinearSolver(TangentSolver):
         """The engine, then (lazily, once for each matrix) SuperLU in its place."""
         yield self.engine
         if self._substitute is None:
-            self._substitute = SuperLU(triangular=self.symmetric)
+            self._substitute = SuperLU(triangular=self._triangular)
             self._substitute.factorise(matrix)
         yield self._substitute
 
