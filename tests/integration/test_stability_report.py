@@ -97,3 +97,12 @@ def test_what_the_solver_cannot_tell_is_stated_and_is_no_warning() -> None:
     assert stable["statement"] == "all 4 solutions are stable"
     assert stability_warnings({"stability": stable}) == []
     assert stability_warnings({}) == []
+
+
+def test_a_default_that_is_unstable_is_said_first() -> None:
+    """All others are followed from there: they may belong to a branch that no body takes."""
+    report = stability_report([SHIFT], SAMPLES, dict.fromkeys(range(4), 3), [-1, 0, 1, 2])
+    assert report["unstable_start"]
+    first, second = stability_warnings({"stability": report})
+    assert "the solution at the defaults, from which all others are followed, is unstable" in first
+    assert second.startswith("4 of 4 solutions are unstable")

@@ -3,6 +3,7 @@
 import meshio
 import numpy as np
 import pytest
+import scipy.optimize
 
 from morph_dslam.mechanics.solvers.buckling import buckling_modes
 from morph_dslam.mechanics.solvers.newton import sensitivities
@@ -323,6 +324,42 @@ def test_a_cloth_hung_by_two_corners():
     assert lowest[2] < -0.5
     # Its middle hangs straight below the line between the corners.
     assert np.average(place, axis=0, weights=study.model_mesh().weights)[1] == pytest.approx(0.55, abs=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "divisions", "young", "gap"), [(20, [20, 2], 2, 25), (100, [14, 3], 10, 4)])
+def test_a_cloth_whose_ends_have_come_together_by_default_hangs_as_a_catenary(width, divisions, young, gap):
+    """Motion and weight together lead the flat shape nowhere, or to a plate compressed in its plane, which is unstable.
+
+    The narrow one is turned inside out at its edge. Sag and pull are those of a rope (Bernoulli).
+    """
+    study = shell_study(f"""
+        mesh = {{ generator = "plate", size = ["200 mm", "{width} mm"], divisions = {divisions} }}
+        shell = {{ thickness = "0.3 mm" }}
+        material = {{ young = "{young} MPa", poisson = 0.0, density = "1 g/cm3" }}
+        loads = [{{ kind = "gravity" }}]
+        parameters = {{ gap = {{ range = ["{gap} mm", "60 mm"] }} }}
+        [[supports]]
+        kind = "fixed"
+        on = "x_min"
+        [[supports]]
+        kind = "displacement"
+        on = "x_max"
+        x = "-1 * gap"
+        y = "0 mm"
+        z = "0 mm"
+    """)
+    sweep = study.sweep_problem()
+    snapshot = sweep.take_snapshot(sweep.first_state())
+    length, span = 0.2, 0.2 - 1e-3 * gap
+    a = scipy.optimize.brentq(lambda a: 2.0 * a * np.sinh(span / 2.0 / a) - length, 0.01, 5.0)
+    weight = 1000.0 * 9.80665 * 0.3e-3 * 1e-3 * width
+    assert snapshot.outputs["negative_pivots"] == 0
+    # Its own bending, and stretching by its weight, are left out by the rope.
+    assert -snapshot.fields["displacement"][:, 2].min() == pytest.approx(a * (np.cosh(span / 2.0 / a) - 1.0), rel=0.01)
+    np.testing.assert_allclose(
+        snapshot.outputs["force_x_max"], [weight * a, 0.0, weight * length / 2.0], rtol=0.02, atol=1e-9
+    )
 
 
 def test_the_euler_load_of_a_clamped_strip():

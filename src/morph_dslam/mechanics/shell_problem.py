@@ -69,7 +69,13 @@ class ShellProblem(SolidProblem):
     loads : see `loads`.
     parameters : the symbols that all of these were written with.
     options : see `ShellOptions`.
+
+    Attributes
+    ----------
+    at_rest : makes the same shell whose supports do not move; None if that is not known.
     """
+
+    at_rest: Callable[[], ShellProblem] | None = None
 
     def __init__(
         self,

@@ -13,8 +13,10 @@ from typing import Any
 import ngsolve as ngs
 import numpy as np
 import scipy.sparse as sp
+from netgen.libngpy._meshing import NgException
 from numpy.typing import NDArray
 
+from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.contact_assembly import added
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solvers.condensation import Condensation, CondensedLinearisation
@@ -155,8 +157,11 @@ class Assembly:
     def tangent(self, x: Array) -> sp.csr_matrix:
         """K, or S where inner dofs are condensed, (n, n) with all entries stored."""
         self._state.vec.FV().NumPy()[:] = x
-        with self._threads():
-            self._form.AssembleLinearization(self._state.vec)
+        try:
+            with self._threads():
+                self._form.AssembleLinearization(self._state.vec)
+        except NgException as error:  # inner unknowns of a cell that is turned inside out cannot be eliminated
+            raise SolverError("the tangent of a cell is singular") from error
         data, indices, indptr = self._form.mat.CSR()
         if self._pattern is None:
             self._pattern = np.array(indices, dtype=np.int32), np.array(indptr, dtype=np.int32)

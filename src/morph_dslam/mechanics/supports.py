@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -255,9 +255,11 @@ def fixed(on: str) -> PrescribedDisplacement:
 
 def held_still(support: PrescribedMotion | ElasticFoundation) -> PrescribedMotion | ElasticFoundation:
     """The support without its motion."""
-    if isinstance(support, ElasticFoundation):
-        return support
-    return PrescribedDisplacement(support.on, *(0.0 if held else None for held in support.components))
+    if isinstance(support, PrescribedDisplacement):
+        return PrescribedDisplacement(support.on, *(0.0 if held else None for held in support.components))
+    if isinstance(support, RigidRotation):
+        return replace(support, angle=0.0, translation=(0.0, 0.0, 0.0))
+    return support  # a foundation or a plane of symmetry stays where it is
 
 
 def cross_matrix(x: float, y: float, z: float) -> Array:

@@ -26,6 +26,10 @@ from morph_dslam.model.reduction_errors import HELD_OUT, ON_MODES, errors_on_mod
 from morph_dslam.studies.problem import Snapshot
 
 Array = NDArray[np.float64]
+UNSTABLE_START = (
+    "the solution at the defaults, from which all others are followed, is unstable: the body would leave it, and may "
+    "be in none of these states. Choose defaults at which loads are small and supports have not moved"
+)
 
 
 def stability_report(
@@ -43,13 +47,16 @@ def stability_report(
     -------
     dict
         "statement"; numbers of solutions "stable", "unstable", "unknown"; "unstable_samples", coordinates and
-        negative pivots of each; "passed", the neighbours between which the count changes.
+        negative pivots of each; "unstable_start", whether what all others are followed from is unstable; "passed", the
+        neighbours between which the count changes.
     """
     counts = {index: count for index, count in sorted(pivots.items()) if count is not None}
     unstable = [index for index, count in counts.items() if count > 0]
     passed = [(parents[index], index) for index, count in counts.items() if counts.get(parents[index], count) != count]
+    starts = [counts[index] for index, parent in enumerate(parents) if parent < 0 and index in counts]
     return {
         "statement": _statement(len(pivots), len(counts), len(unstable), len(passed)),
+        "unstable_start": bool(starts) and min(starts) > 0,
         "stable": len(counts) - len(unstable),
         "unstable": len(unstable),
         "unknown": len(pivots) - len(counts),
@@ -75,7 +82,7 @@ def stability_warnings(certificate: dict[str, Any]) -> list[str]:
     report = certificate.get("stability")
     if report is None or not report["unstable"] + len(report["passed"]):
         return []
-    lines = [report["statement"]]
+    lines = [UNSTABLE_START, report["statement"]] if report.get("unstable_start") else [report["statement"]]
     for place in report["passed"][:3]:
         before, after = place["negative_pivots"]
         lines.append(f"negative pivots change from {before} to {after} between {' and '.join(place['between'])}")

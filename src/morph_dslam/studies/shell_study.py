@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.shell_problem import ShellOptions, ShellProblem
+from morph_dslam.mechanics.supports import held_still
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.studies.body_study import (
     BodyStudy,
@@ -43,6 +45,8 @@ from morph_dslam.studies.snapshots import SOLVER_VERSION
 from morph_dslam.studies.solid_sections import mesh_fingerprint
 from morph_dslam.studies.solid_sweep import loadable
 
+#: Raised by whoever changes from where shells are followed: their solutions of another number are solved anew.
+SHELL_VERSION = 2
 #: Kinds of supports and loads that name a cell set; others name nodes.
 _ON_CELLS = ("foundation", "traction", "force", "pressure", "body_force", "moving_patch", "moving_line")
 
@@ -112,7 +116,7 @@ class ShellStudy(BodyStudy, Section):
         content["elements"] = self.solver.order
         content["parameters"] = list(self.parameters)
         content["mesh"] = mesh_fingerprint(self.shell_mesh())
-        content["code"] = SOLVER_VERSION
+        content["code"] = [SOLVER_VERSION, SHELL_VERSION]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def problem(self, options: ShellOptions | None = None) -> ShellProblem:
@@ -122,15 +126,17 @@ class ShellStudy(BodyStudy, Section):
         check_reach(self.loads, mesh, symbols.parameters)
         check_symmetry(self.supports, mesh)
         read = reader_of(symbols)
-        return ShellProblem(
-            mesh,
-            self.material.make(read),
-            self.shell.make(read),
-            [section.make(read) for section in self.supports],
-            [section.make(read) for section in self.loads],
-            symbols,
-            options or ShellOptions(order=self.solver.order, threads=self.work.threads),
-        )
+        material, thickness = self.material.make(read), self.shell.make(read)
+        loads = [section.make(read) for section in self.loads]
+        elements = options or ShellOptions(order=self.solver.order, threads=self.work.threads)
+
+        def shell(supports: list[Any]) -> ShellProblem:
+            return ShellProblem(mesh, material, thickness, supports, loads, symbols, elements)
+
+        supports = [section.make(read) for section in self.supports]
+        problem = shell(supports)
+        problem.at_rest = partial(shell, [held_still(support) for support in supports])
+        return problem
 
     def sweep_problem(self) -> SweepProblem:
         """What the sweep solves with."""
