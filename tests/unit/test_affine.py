@@ -1,5 +1,6 @@
 """Expressions of parameters in study files, and units."""
 
+import re
 from math import pi
 
 import numpy as np
@@ -82,6 +83,23 @@ def test_expression_is_the_same_function_of_other_variables():
 def test_mistakes(text, quantity, message):
     with pytest.raises(StudyError, match=message):
         read_affine(text, quantity, PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ("text", "quantity"),
+    [
+        ("share", "angle"),
+        ("-9.81 * share", "acceleration"),
+        ("tilt", "stress"),
+        ("2 * load", "ratio"),
+        ("load/2", "stress"),
+    ],
+)
+def test_what_messages_tell_to_write_can_be_read(text, quantity):
+    with pytest.raises(StudyError) as refused:
+        read_affine(text, quantity, PARAMETERS)
+    (advised,) = re.findall('"(.+?)"', str(refused.value))
+    assert not read_affine(advised, quantity, PARAMETERS).fixed
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def test_a_point_outside_is_named_with_its_distance():
     with pytest.raises(ParameterError, match=r"1 of 2 points .* \(92, 10, 10\) mm, about 12 mm away"):
         model.points([[0.01, 0.01, 0.01], [0.092, 0.01, 0.01]])
     for wrong in ([1.0, 2.0], [[0.01, 0.01, np.nan]]):
-        with pytest.raises(ParameterError, match=r"points are finite positions \(p, 3\)"):
+        with pytest.raises(ParameterError, match=r"points are positions \(p, 3\)"):
             model.points(wrong)
 
 

@@ -177,6 +177,22 @@ def test_what_was_not_reached_is_said_and_no_jump_is_made_of_it(tmp_path: Path) 
     assert "unresolved" not in rounds[-1]
 
 
+def test_an_error_that_does_not_fall_is_no_lack_of_samples(tmp_path: Path) -> None:
+    """Waves that become shorter without end towards 0.37: however near samples are, they miss what is between them."""
+    chosen, at = study(), 0.37
+
+    def waves(t: float) -> tuple[float, float]:
+        phase = 0.01 / (t - at)
+        return 1.0 + t + 0.3 * np.sin(phase), 1.0 - 0.3 * np.cos(phase) * phase / (t - at)
+
+    samples, rounds = sample_by_bisection(chosen, sweep_of(waves, chosen, tmp_path))
+    assert len(samples) < chosen.sampling.training
+    (place,) = rounds[-1]["unresolved"]
+    low, high = np.array(place["between"]) / 6e5
+    assert place["why"] == "steady"
+    assert low < at < high
+
+
 @pytest.mark.parametrize(("function", "why"), [(step, "jump"), (bend, "failed")])
 def test_where_no_solution_is_found_the_error_is_not_forgotten(tmp_path: Path, function: Callable, why: str) -> None:
     """Solutions around the jump, or the bend, are missing: samples there stop, and the interval is named."""

@@ -81,6 +81,7 @@ class Rotation:
     curvatures: Array
 
     @staticmethod
+    @np.errstate(over="ignore", invalid="ignore")  # an iteration that diverges is told by values that are not finite
     def of(vector: Array) -> Rotation:
         """Of a rotation vector (3,), rad."""
         square = float(vector @ vector)

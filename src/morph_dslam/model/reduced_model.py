@@ -289,8 +289,10 @@ class ReducedModel:
         from morph_dslam.model.point_location import material_points
 
         places = np.atleast_2d(np.asarray(positions, dtype=np.float64))
-        if places.ndim != 2 or places.shape[1] != 3 or not np.isfinite(places).all():
-            raise ParameterError(f"points are finite positions (p, 3) in metres, not an array of shape {places.shape}")
+        if places.ndim != 2 or places.shape[1] != 3:
+            raise ParameterError(f"points are positions (p, 3) in metres, not an array of shape {places.shape}")
+        if not np.isfinite(places).all():
+            raise ParameterError("points are positions (p, 3) in metres; some of these are not finite")
         return material_points(self.nodes, self.cells or {"tri3": self.triangles}, places, reach)
 
     def spread_parameters(self, count: int) -> Array:

@@ -9,7 +9,7 @@ alone: a build that was stopped takes them again and finds them on disk.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -66,7 +66,8 @@ def sample_by_bisection(
     displacement, or at ``sampling.training`` samples. Intervals are halved no further where solutions jump. The last
     round has "unresolved" intervals in which the tolerance was missed and that were not halved: "between" (two
     coordinates, SI), "estimate" in the middle of the interval that it is a half of, and "why": "jump" where solutions
-    do, "failed" where the middle could not be solved, "training" where samples ran out.
+    do, "failed" where the middle could not be solved, "training" where samples ran out, "steady" where the error does
+    not fall in ever shorter intervals.
     """
     weights, tolerance = study.model_mesh().weights, study.reduction.tolerance
     samples = even_samples(study, study.sampling.first)
@@ -74,11 +75,11 @@ def sample_by_bisection(
     waiting = [_Interval(float(low), float(high)) for low, high in pairwise(samples[:, 0])]
     least = LEAST * (samples[-1, 0] - samples[0, 0])
     rounds: list[dict[str, Any]] = []
-    left: list[_Interval] = []
-    failed: list[_Interval] = []
+    reasons: dict[_Interval, str] = {}
     while waiting:
         room = max(study.sampling.training - len(samples), 0)
-        waiting, left = waiting[:room], left + waiting[room:]
+        reasons |= {part: "training" for part in waiting[room:] if part.errors}
+        waiting = waiting[:room]
         if not waiting:
             break
         line = _Line([load_snapshot(path) for _, path in sorted(solved.items())], weights)
@@ -86,25 +87,25 @@ def sample_by_bisection(
         solved = sweep(samples).solved
         new = range(len(samples) - len(waiting), len(samples))
         # What cannot be solved is not looked at any closer.
-        failed += [part for part, index in zip(waiting, new, strict=True) if index not in solved]
+        reasons |= {part: "failed" for part, index in zip(waiting, new, strict=True) if index not in solved}
         errors = np.array([line.error(load_snapshot(solved[index])) if index in solved else 0.0 for index in new])
         rounds.append({"solves": len(samples), "largest_estimate": float(errors.max())})
         # The worst first, in case samples run out.
         worst = [index for index in np.argsort(-errors, kind="stable") if errors[index] > tolerance]
         halves = [half for index in worst for half in waiting[index].halves(float(errors[index]))]
         waiting = [half for half in halves if half.high - half.low > least or not half.steady]
-        left += [half for half in halves if half not in waiting]
-    if missed := [*failed, *(part for part in left if part.errors)]:
+        reasons |= {half: "steady" for half in halves if half not in waiting}
+    if reasons:
         line = _Line([load_snapshot(path) for _, path in sorted(solved.items())], weights)
-        if found := _unresolved(missed, set(failed), line, least):
+        if found := _unresolved(reasons, line, least):
             rounds[-1]["unresolved"] = found
     return samples, rounds
 
 
-def _unresolved(
-    missed: Sequence[_Interval], failed: Collection[_Interval], line: _Line, least: float
-) -> list[dict[str, Any]]:
-    """What is said of intervals that were not halved; shorter ones than ``least`` jump whatever their slopes are.
+def _unresolved(missed: Mapping[_Interval, str], line: _Line, least: float) -> list[dict[str, Any]]:
+    """What is said of intervals that were ``missed``, by the reason why they were not halved.
+
+    Those shorter than ``least`` jump whatever their slopes are.
 
     One without errors, whose middle could not be solved, is only known by its ends.
     """
@@ -117,7 +118,7 @@ def _unresolved(
         beside = any(part.low - width <= jump.low and jump.high <= part.high + width for jump in jumps)
         if part not in jumps and (beside or not part.errors):
             continue
-        why = "jump" if part in jumps else "failed" if part in failed else "training"
+        why = "jump" if part in jumps else missed[part]
         estimate = part.errors[-1] if part.errors else line.step(part) / 2.0
         entry = {"between": [part.low, part.high], "estimate": estimate, "why": why}
         if found and why != "jump" and (found[-1]["between"][1], found[-1]["why"]) == (part.low, why):

@@ -139,7 +139,9 @@ def _read_term(
     name = term["factor"] or term["name"]
     if name is not None and name not in known:
         listed = f"the parameters are {', '.join(known)}" if known else "the study has no parameters"
-        raise StudyError(f"'{text}' names '{name}', which is no parameter; {listed}")
+        divided = name.partition("/")[0]
+        hint = f'; numbers that divide become factors, "0.5 * {divided}" for its half' if divided in known else ""
+        raise StudyError(f"'{text}' names '{name}', which is no parameter; {listed}{hint}")
     measured = "ratio" if name is None else parameters[known[name]].quantity
     share = 1.0
     if term["divisor"] is not None:
@@ -186,4 +188,5 @@ def _proportional(quantity: str, parameter: Parameter) -> str:
     """How a quantity that is proportional to a parameter is written."""
     unit = next(iter(FACTORS[quantity]))
     factor = "" if quantity == "ratio" else f"10 {unit} * "
-    return f'"{factor}{parameter.name} / 1 {parameter.unit}" for example'
+    divisor = "" if parameter.quantity == "ratio" else f" / 1 {parameter.unit}"
+    return f'"{factor}{parameter.name}{divisor}" for example'

@@ -54,6 +54,10 @@ MISSED = {
         "the model has {error} {where}, where the tolerance is {tolerance} and a solution in between was not found: "
         "narrow {ranges}"
     ),
+    "steady": (
+        "the model has {error} {where}, where the tolerance is {tolerance} and the error does not fall with more "
+        "solutions, as where they change abruptly: narrow {ranges}"
+    ),
 }
 UNMOVED_BODY = (
     "no solution moves the body: its loads are zero, miss it or act where it is held, or no obstacle reaches it; check "

@@ -306,9 +306,11 @@ def _check_reach(study: ParametricStudy, samples: Array, result: SweepResult, fo
         parameter, solved = study.model_parameters()[0], samples[list(result.solved), 0]
         beyond = [i for i in result.failed if not solved.min() < samples[i, 0] < solved.max()]
         if beyond:
+            within = solved.min() <= study.root()[0] <= solved.max()
             reached = [parameter.display(value) for value in (solved.min(), solved.max())]
             raise StudyError(
                 f"{parameter.name} could only be followed from {reached[0]:.4g} to {reached[1]:.4g} "
                 f"{parameter.unit}: {result.failed[beyond[0]]}. The solutions up to there are kept in "
-                f"{folder}; with that range the same command goes on from them. {study.advice}"
+                f"{folder}; with that range{'' if within else ' and a default in it'} the same command goes on from "
+                f"them. {study.advice}"
             )
