@@ -62,6 +62,30 @@ def test_stresses_that_no_such_material_bears(load, ranges, said):
     assert said is None or "the stiffest material (50 kPa)" in found
 
 
+@pytest.mark.parametrize(
+    ("coupling", "ranges", "said"),
+    [
+        ({"force": ["f", "0 N", "0 N"]}, {"f": ("0 N", "1 kN")}, "Coupling 1 reaches 2.5 MPa, 50 times"),
+        ({"force": ["f", "0 N", "0 N"]}, {"f": ("0 N", "390 N")}, None),
+        # 6 M / h^3 at the edges of a square, h = 20 mm.
+        ({"moment": ["0 N.m", "m", "0 N.m"]}, {"m": ("0 N.m", "5 N.m")}, "Coupling 1 reaches 3.75 MPa, 75 times"),
+        ({"moment": ["0 N.m", "m", "0 N.m"]}, {"m": ("0 N.m", "1.3 N.m")}, None),
+        # The mesh is 49 mm long; the set begins 40 mm above the origin.
+        (
+            {"force": ["f", "0 N", "0 N"], "point": ["10 mm", "10 mm", "40 m"]},
+            {"f": ("0 N", "1 N")},
+            "Coupling 1 has its point 3.996e+04 mm from its set, where the mesh is 48.99 mm long: is its unit right",
+        ),
+        ({"force": ["f", "0 N", "0 N"], "point": ["10 mm", "10 mm", "80 mm"]}, {"f": ("0 N", "1 N")}, None),
+    ],
+)
+def test_couplings_that_no_such_body_bears(coupling, ranges, said):
+    parameters = {name: {"range": list(ends)} for name, ends in ranges.items()}
+    found = make_study(BLOCK | {"couplings": [{"on": "z_max"} | coupling], "parameters": parameters}).advice
+    assert ("right?" in found) == (said is not None)
+    assert (said or "Narrow the ranges") in found
+
+
 def test_a_range_a_thousand_times_too_large_names_how_far_the_body_could_be_followed():
     """A long tube under inner pressure: with a thin wall p = (wall / radius) G (1 - stretch^-4) at most."""
     sides = (("bottom", "z"), ("top", "z"), ("start", "y"), ("end", "x"))

@@ -17,7 +17,7 @@ from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.body_study import numbered, range_ends
-from morph_dslam.studies.solid_sections import ForceLoad, MovingLineLoad, MovingPatchLoad, Value
+from morph_dslam.studies.solid_sections import CouplingSection, ForceLoad, MovingLineLoad, MovingPatchLoad, Value
 
 #: Loads of more than so many shear moduli carry no rubber's shape any more: their unit is probably wrong.
 MOST_MODULI = 20.0
@@ -25,24 +25,47 @@ MOST_MODULI = 20.0
 MOST_SIZES = 20.0
 
 
-def load_doubt(loads: Iterable[Any], materials: Iterable[Any], mesh: Mesh, parameters: Sequence[Parameter]) -> str:
-    """A sentence on the first load on a surface that is far too large for the stiffest material; else "".
+def load_doubt(
+    loads: Iterable[Any],
+    couplings: Iterable[CouplingSection],
+    materials: Iterable[Any],
+    mesh: Mesh,
+    parameters: Sequence[Parameter],
+) -> str:
+    """A sentence on the first load that is far too large for the stiffest material, or acts far away; else "".
 
     Parameters
     ----------
-    loads, materials : sections of a study.
-    mesh : with the surfaces that loads name.
+    loads, couplings, materials : sections of a study.
+    mesh : with the sets that loads and couplings name.
     parameters : that they may name; materials count at the defaults, loads where the ranges make them largest.
     """
     shear = max(_shear_modulus(section, parameters) for section in materials)
-    for where, section in numbered("load", loads):
+    coupled = numbered("coupling", couplings)
+    for where, section in (*numbered("load", loads), *coupled):
         largest = _largest_stress(section, mesh, parameters)
         if largest > MOST_MODULI * shear:
             return (
                 f"{where.capitalize()} reaches {_shown(largest)}, {largest / shear:.0f} times the shear modulus of the "
                 f"stiffest material ({_shown(shear)}): are its unit and that of the modulus right? "
             )
-    return ""
+    return "".join(_point_doubt(where, section, mesh, parameters) for where, section in coupled)
+
+
+def _point_doubt(where: str, section: CouplingSection, mesh: Mesh, parameters: Sequence[Parameter]) -> str:
+    """A sentence if a coupling's point is, at the defaults, farther from its set than the mesh is long; else ""."""
+    if section.point is None:
+        return ""
+    defaults = np.array([parameter.default for parameter in parameters])
+    point = np.array([read_affine(value, "length", parameters)(defaults) for value in section.point])
+    distance = float(np.linalg.norm(mesh.nodes[mesh.set_nodes(section.on)] - point, axis=1).min())
+    length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    if distance <= length:
+        return ""
+    return (
+        f"{where.capitalize()} has its point {1e3 * distance:.4g} mm from its set, where the mesh is "
+        f"{1e3 * length:.4g} mm long: is its unit right? "
+    )
 
 
 def shell_load_doubt(problem: ShellProblem) -> str:
@@ -84,7 +107,8 @@ def _shear_modulus(section: Any, parameters: Sequence[Parameter]) -> float:
 def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter]) -> float:
     """The largest pressure, or component of a traction, anywhere in the ranges of the parameters, Pa.
 
-    Forces over a surface count with their mean, those of moving loads with that at their centre on a plane.
+    Forces over a surface count with their mean, those of moving loads with that at their centre on a plane, moments
+    with the stress at the edges of a square that they bend.
     """
     over = {"pressure": 1.0, "stress": 1.0} | _areas(section, mesh)
     ends = np.array([[parameter.lower, parameter.upper] for parameter in parameters])
@@ -103,13 +127,17 @@ def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter]) -
 
 
 def _areas(section: Any, mesh: Mesh) -> dict[str, float]:
-    """Area, m2, or width, m, that a force or force per length of a load is spread over, by the quantity."""
+    """Area, m2, or width, m, that a force or force per length is spread over, by the quantity; for moments, m3."""
     if isinstance(section, ForceLoad):
         return {"force": faces_figures(mesh, mesh.surface(section.on))[0]}
     if isinstance(section, MovingPatchLoad):
         return {"force": 2.0 * np.pi * section.width**2}
     if isinstance(section, MovingLineLoad):
         return {"force per length": np.sqrt(2.0 * np.pi) * section.width}
+    if isinstance(section, CouplingSection):
+        # Nodes need not have whole faces between them. Those on a line are refused elsewhere.
+        area = float(np.sort(np.ptp(mesh.nodes[mesh.set_nodes(section.on)], axis=0))[1:].prod())
+        return {"force": area, "moment": area**1.5 / 6.0} if area else {}
     return {}
 
 

@@ -206,7 +206,9 @@ class SolidStudy(BodyStudy, Section):
 
     def load_doubt(self) -> str:
         """A sentence, and a space, on a load that is too large for the materials by far; else ""."""
-        return load_doubt(self.loads, self.materials.values(), self.solid_mesh(), self.model_parameters())
+        return load_doubt(
+            self.loads, self.couplings, self.materials.values(), self.solid_mesh(), self.model_parameters()
+        )
 
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
