@@ -346,7 +346,7 @@ def test_cameras_that_do_not_agree_are_named_and_one_recording_twice_is_refused(
         with h5py.File(tmp_path / camera / "result.h5") as file:
             unexplained[camera] = np.nanmax(file["unexplained_px"][()])
     assert "the cameras do not agree with each other" not in said["camchain"]
-    assert "of 5 frames the cameras do not agree with each other: up to" in said["moved"]
+    assert "of 5 frames the cameras do not agree with each other, first in frame 1: up to" in said["moved"]
     assert unexplained["camchain"] < 0.1
     assert unexplained["moved"] > 0.5
     twice = [

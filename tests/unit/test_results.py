@@ -14,7 +14,20 @@ from morph_dslam.tracking.binding import facing, view_of
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, State
 from morph_dslam.tracking.measurement import ReferenceAppearance, visible_surface
-from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
+from morph_dslam.tracking.outcomes import (
+    CameraIgnored,
+    CameraLost,
+    CamerasDisagree,
+    DepthNotUsed,
+    FewPointsAgree,
+    FoundBy,
+    ModelDoesNotExplain,
+    ObjectMoved,
+    OtherReferenceView,
+    Rejection,
+    RejectionReason,
+    Status,
+)
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_folder import summarise
 from morph_dslam.tracking.run_notices import RunNotice, RunWarning, notices_of
@@ -126,6 +139,29 @@ def test_summary_counts_and_flags():
     turning = replace(run, revolution_angles=("arch",))
     assert notices_of(turning) == [lost, unobservable]
     assert not turning.at_bound().any()
+
+
+PER_FRAME = [
+    (ObjectMoved(), RunWarning.MOVED),
+    (FewPointsAgree(0.5), RunWarning.FEW_AGREE),
+    (ModelDoesNotExplain(0.7), RunWarning.MODEL_FAILS),
+    (CamerasDisagree(0.7), RunWarning.CAMERAS_DISAGREE),
+    (CameraLost("too few points"), RunWarning.CAMERA_LOST),
+    (CameraIgnored(1, Status.LOST), RunWarning.CAMERA_IGNORED),
+    (DepthNotUsed(), RunWarning.DEPTH_NOT_USED),
+]
+
+
+@pytest.mark.parametrize(("warning", "expected"), PER_FRAME)
+def test_a_run_says_in_how_many_frames_it_warns_and_in_which_first(warning, expected):
+    run = RunResults(MODEL, reference_frame=0)
+    frames = [(), (OtherReferenceView(1),), (warning,), (), (warning, OtherReferenceView(1))]
+    for number, warnings in enumerate(frames):
+        sound = frame_result([0.0, 0.0, 0.0], [1e-3, 0.01, 0.01], [False] * 3)
+        run.add(10 + number, 0.1 * number, replace(sound, warnings=warnings))
+    (notice,) = notices_of(run)
+    assert (notice.warning, notice.data["count"], notice.data["first"]) == (expected, 2, 12)
+    assert "first in frame 12" in notice.text
 
 
 def test_fields_that_the_model_misses_are_named_and_forces_say_what_their_deviations_lack(tmp_path, capsys):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,21 @@ from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
-from morph_dslam.tracking.outcomes import CamerasDisagree, DepthNotUsed, ModelDoesNotExplain, ObjectMoved, Status
+from morph_dslam.tracking.outcomes import (
+    CameraIgnored,
+    CameraLost,
+    CamerasDisagree,
+    DepthNotUsed,
+    FewPointsAgree,
+    ModelDoesNotExplain,
+    ObjectMoved,
+    Status,
+    TrackingWarning,
+)
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, FLOOR_PX, UNEXPLAINED_PX
+
+_Warning = TypeVar("_Warning", bound=TrackingWarning)
 
 
 class RunWarning(StrEnum):
@@ -35,27 +47,39 @@ class RunWarning(StrEnum):
         "the object has moved from its place in the map in {count} {frames}, first in frame {first}: there its points "
         "alone give its pose; register it again to use the map"
     )
+    FEW_AGREE = (
+        "few points agree, and less closely than usual, in {count} of {n_frames} frames, first in frame {first}: "
+        "something is before the object, or it was taken for what looks like it; do not rely on these frames"
+    )
     MODEL_FAILS = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
-        "frames: there the object deforms otherwise, as by another law, support or shape, a crack or a slip, or the "
-        "camera is another one"
+        "frames, first in frame {first}: there the object deforms otherwise, as by another law, support or shape, a "
+        "crack or a slip, or the camera is another one"
     )
     RIGID_FAILS = (
-        "up to {largest_px:.1f} px that neighbouring points have in common are left in {count} of {n_frames} frames: "
-        "the mesh, its place in the map or the camera file is off by as much"
+        "up to {largest_px:.1f} px that neighbouring points have in common are left in {count} of {n_frames} frames, "
+        "first in frame {first}: the mesh, its place in the map or the camera file is off by as much"
     )
     CAMERAS_DISAGREE = (
-        "in {count} of {n_frames} frames the cameras do not agree with each other: up to {largest_px:.1f} px that "
-        "neighbouring points have in common are left; the poses of the cameras are wrong (`morph calibrate --with`), "
-        "or frames of one number are not of one instant"
+        "in {count} of {n_frames} frames the cameras do not agree with each other, first in frame {first}: up to "
+        "{largest_px:.1f} px that neighbouring points have in common are left; the poses of the cameras are wrong "
+        "(`morph calibrate --with`), or frames of one number are not of one instant"
+    )
+    CAMERA_LOST = (
+        "the camera was not found in the map in {count} of {n_frames} frames, first in frame {first}: there the "
+        "object's points alone give its pose"
+    )
+    CAMERA_IGNORED = (
+        "camera {camera} does not count in {count} of {n_frames} frames, first in frame {first}; the reasons are in "
+        "frames.csv"
     )
     SURFACE_JUMPS = (
         "from frame {first} on the surface opens or slips along a line, as at a crack, which the model does not have: "
         "by up to {where}; stress near it does not hold and is drawn grey (plots/jumps.png)"
     )
     DEPTH_NOT_USED = (
-        "the depth images did not count in {count} of {n_frames} frames, where they show nothing of the object or put "
-        "it elsewhere (check their scale); the reasons are in frames.csv"
+        "the depth images did not count in {count} of {n_frames} frames, first in frame {first}, where they show "
+        "nothing of the object or put it elsewhere (check their scale); the reasons are in frames.csv"
     )
     DOUBTFUL_FIELDS = (
         "the model misses {errors} at held-out solutions of its study: do not rely on these here, "
@@ -125,21 +149,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     by_outline = sum(result.by_outline for result in run.results)
     if by_outline:
         found.append(of(RunWarning.BY_OUTLINE, count=by_outline, n_frames=n_frames))
-    moved = [frame for frame, r in zip(run.frames, run.results, strict=True) if r.warning(ObjectMoved)]
-    if moved:
-        found.append(of(RunWarning.MOVED, count=len(moved), first=moved[0]))
-    without_depth = sum(result.warning(DepthNotUsed) is not None for result in run.results)
-    if without_depth:
-        found.append(of(RunWarning.DEPTH_NOT_USED, count=without_depth, n_frames=n_frames))
-    failed = sum(result.warning(ModelDoesNotExplain) is not None for result in run.results)
-    if failed:
-        largest = float(np.nanmax(run.unexplained_px()))
-        warning = RunWarning.MODEL_FAILS if run.model.parameters else RunWarning.RIGID_FAILS
-        found.append(of(warning, count=failed, n_frames=n_frames, largest_px=largest))
-    apart = [warning for result in run.results if (warning := result.warning(CamerasDisagree)) is not None]
-    if apart:
-        largest = max(warning.residual_px for warning in apart)
-        found.append(of(RunWarning.CAMERAS_DISAGREE, count=len(apart), n_frames=n_frames, largest_px=largest))
+    found += _of_frames(run)
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
         found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))
@@ -150,6 +160,39 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     if doubtful:
         found.append(of(RunWarning.DOUBTFUL_FIELDS, relative=doubtful, errors=errors_in_words(doubtful)))
     return [*found, *_unobservable(run, held)]
+
+
+def _of_frames(run: RunResults) -> list[RunNotice]:
+    """In how many frames something was warned of, and in which first."""
+    found, kind = list[RunNotice](), RunWarning
+
+    def tell(warned: list[tuple[int, _Warning]], warning: RunWarning, **data: Any) -> None:
+        if warned:
+            found.append(RunNotice.of(warning, count=len(warned), n_frames=len(run), first=warned[0][0], **data))
+
+    tell(_warned(run, ObjectMoved), kind.MOVED)
+    tell(_warned(run, CameraLost), kind.CAMERA_LOST)
+    ignored = _warned(run, CameraIgnored)
+    for number in sorted({warning.camera for _, warning in ignored}):
+        tell(
+            [(frame, warning) for frame, warning in ignored if warning.camera == number],
+            kind.CAMERA_IGNORED,
+            camera=number,
+        )
+    tell(_warned(run, DepthNotUsed), kind.DEPTH_NOT_USED)
+    tell(_warned(run, FewPointsAgree), kind.FEW_AGREE)
+    largest = float(np.nanmax(run.unexplained_px(), initial=0.0))
+    fails = kind.MODEL_FAILS if run.model.parameters else kind.RIGID_FAILS
+    tell(_warned(run, ModelDoesNotExplain), fails, largest_px=largest)
+    apart = _warned(run, CamerasDisagree)
+    tell(apart, kind.CAMERAS_DISAGREE, largest_px=max((warning.residual_px for _, warning in apart), default=0.0))
+    return found
+
+
+def _warned(run: RunResults, kind: type[_Warning]) -> list[tuple[int, _Warning]]:
+    """The warnings of a kind, with the frames that they are of."""
+    pairs = zip(run.frames, run.results, strict=True)
+    return [(frame, warning) for frame, result in pairs for warning in result.warnings if isinstance(warning, kind)]
 
 
 def flags_of(notices: Sequence[Notice]) -> list[str]:
