@@ -1,6 +1,7 @@
 """Frame sources: order, numbering, ranges, layouts of benchmarks, written videos, and registered kinds."""
 
 import re
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -406,6 +407,31 @@ def test_no_frames_no_file_and_the_older_video_stays(tmp_path):
     write_video(tmp_path / "out.mp4", 3)
     write_video(tmp_path / "out.mp4", 0)
     assert len(list(open_source(tmp_path / "out.mp4"))) == 3
+
+
+@contextmanager
+def files_up_to(n_bytes):
+    """Files cannot grow beyond that, as on a full disk."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_video_on_a_full_disk_is_an_error_and_leaves_nothing_that_does_not_play(tmp_path):
+    write_video(tmp_path / "out.mp4", 1)
+    with files_up_to(1024), pytest.raises(SourceError, match="was not written whole, it is left out"):
+        write_video(tmp_path / "out.mp4", 40)
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupt_goes_on_where_the_video_is_lost_as_well(tmp_path, caplog):
+    with files_up_to(1024), pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "out.mp4", 40, KeyboardInterrupt())
+    assert "was not written whole" in caplog.text
 
 
 def test_missing_folder(tmp_path):

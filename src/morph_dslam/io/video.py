@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 from types import TracebackType
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
 from morph_dslam.interrupts import WaitingInterrupts
+from morph_dslam.sources.frames import open_capture
 
+_LOG = logging.getLogger("morph_dslam")
 #: MPEG-4 part 2: the wheels of OpenCV carry no H.264 encoder, and their VP9 takes 120 ms a frame.
 CODEC = "mp4v"
 
@@ -21,7 +24,8 @@ class VideoWriter:
     """An mp4 file written frame by frame, as a context manager.
 
     Frames go to a file beside ``path``; leaving the context, by an exception or an interrupt as well,
-    completes it and gives it its name, so whatever was written plays. Without a single frame no file is left.
+    completes it and gives it its name, so that what was written until then plays. Without a single frame an older
+    file stays; where none can be read back no file is left.
 
     Parameters
     ----------
@@ -32,7 +36,8 @@ class VideoWriter:
     Raises
     ------
     SourceError
-        On entering the context, if no video can be written there.
+        On entering the context, if no video can be written there; on leaving it, if frames are missing in the file, as
+        on a full disk. Where another exception leaves the context, that goes on and this is logged.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
@@ -81,7 +86,25 @@ class VideoWriter:
         with WaitingInterrupts():
             self._writer.release()
             self._writer = None
-            if self.n_frames:
+            n_readable = _n_readable(self._partial) if self.n_frames else 0
+            if n_readable:
                 os.replace(self._partial, self._path)
             else:
                 self._partial.unlink(missing_ok=True)
+            if self.n_frames and not n_readable:
+                self._path.unlink(missing_ok=True)  # an older one does not show what was written now
+        if n_readable >= self.n_frames:
+            return
+        kept = f"only {n_readable} of its {self.n_frames} frames are there" if n_readable else "it is left out"
+        message = f"the video {self._path} was not written whole, {kept}: check whether the disk is full"
+        if kind is None:
+            raise SourceError(message)
+        _LOG.warning(message)
+
+
+def _n_readable(path: Path) -> int:
+    """Number of frames that a video holds; 0 if it cannot be opened. OpenCV does not tell of what it did not write."""
+    capture = open_capture(str(path))
+    n_frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+    capture.release()
+    return n_frames

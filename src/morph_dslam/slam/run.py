@@ -130,7 +130,7 @@ def run_slam(
                 watch = (lambda image, frame: writer.write(draw_frame(image, frame))) if writer else None
                 for frame in track_frames(slam, stream, progress, watch):
                     frames.append(frame)
-            again = stream if isinstance(stream, FrameSource) and known is None else None
+                again = stream if isinstance(stream, FrameSource) and known is None else None
         except MapError:
             frames.clear()  # nothing of a run whose depth contradicts the map may replace an earlier one
             raise

@@ -92,6 +92,8 @@ def track(run: TrackOptions, tell: Tell = lambda folder, summary: None) -> dict[
         writing to it (TrackingError).
     StreamError
         If a stream cannot be opened; or did not get all frames, after the run folders were written.
+    SourceError
+        If the video could not be written whole, after the run folders were written.
     """
     with ExitStack() as stack:
         run, source, placed = prepare(run, stack)
@@ -228,6 +230,7 @@ class _Job:
         self._log = None if run.frame_log is None else FrameLog(run.frame_log, self._folders[0])
         self._streams = self._opened_streams(stack)
         sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
+        self._video = stack.enter_context(ExitStack())
         screens = self._screens(stack) if run.live else []
         if run.live:
             sinks += [self._times, *screens]
@@ -252,7 +255,8 @@ class _Job:
         run = self._run
         if run.live:
             print(f"tracking {self._source.name} (Ctrl-C ends it)", file=sys.stderr)
-            self._session.run(run.seconds)
+            with self._video:  # ended before the results are written: on a full disk it makes room for them
+                self._session.run(run.seconds)
         else:
             with self._interrupts:
                 self._session.run(progress=True)
@@ -366,7 +370,7 @@ class _Job:
         if self._run.video:
             camera, fps = self._placed[0].camera, self._source.fps
             path = self._run.output / "augmented.mp4"
-            writer = stack.enter_context(VideoWriter(path, fps, (camera.width, camera.height)))
+            writer = self._video.enter_context(VideoWriter(path, fps, (camera.width, camera.height)))
             screens.append(VideoSink(writer, fps))
         return screens
 
