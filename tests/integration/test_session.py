@@ -1,5 +1,7 @@
 """Several objects, several cameras, and what goes with them, on rendered sheets with known states."""
 
+import shutil
+
 import h5py
 import numpy as np
 import pytest
@@ -359,5 +361,47 @@ def test_frames_of_different_numbers_do_not_go_together(rig_recording_of_sheet):
     front, aside = (md.open_source(rig_recording_of_sheet / "front", first) for first in (0, 1))
     both = SynchronizedFrames([front, aside])
     assert len(both) == 4
-    with pytest.raises(md.MorphError, match="frames 0, 1 come at the same time"):
+    with pytest.raises(md.MorphError, match="begin with frames 0, 1"):
         next(iter(both))
+
+
+def numbered(*numbers):
+    return [md.Frame(number, number / 30.0, np.full((4, 4, 3), number, dtype=np.uint8)) for number in numbers]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "left_out"),
+    [
+        ([(0, 1, 2, 3), (0, 2, 3)], {1}),
+        ([(0, 2, 3, 5, 6), (0, 1, 3, 4, 6), (0, 3, 6)], {1, 2, 4, 5}),
+        ([(0, 1, 2, 3, 4), (0, 2)], {1}),  # those after the end of the shortest do not count
+    ],
+)
+def test_frames_that_one_camera_lacks_are_left_out(cameras, left_out):
+    both = SynchronizedFrames([numbered(*numbers) for numbers in cameras])
+    common = sorted(set.intersection(*map(set, cameras)))
+    for _ in range(2):
+        assert [[frame.index for frame in frames] for frames in both] == [[n] * len(cameras) for n in common]
+        assert both.n_left_out == len(left_out)
+
+
+def test_a_frame_missing_in_one_camera_of_a_rig_leaves_a_gap(rig_recording_of_sheet, tmp_path, capsys):
+    folder = tmp_path / "rig"
+    shutil.copytree(rig_recording_of_sheet, folder)
+    next((folder / "aside").glob("*2.png")).unlink()
+    assert run_command(with_both_cameras(folder, tmp_path / "run")) == 0
+    said = capsys.readouterr().out
+    assert "the cameras recorded 5, 4 frames: 4 were tracked, 1 before the end" in said
+    run = load_run(tmp_path / "run")
+    assert run.frames.tolist() == [0, 1, 3, 4]
+    assert len(md.open_source(tmp_path / "run" / "augmented.mp4")) == 4
+
+
+def test_an_object_out_of_the_picture_of_a_camera_of_a_rig_is_named(rig_recording_of_sheet, tmp_path, refused):
+    """The baseline in millimetres instead of metres."""
+    folder, pose = rig_recording_of_sheet, ASIDE.camera_from_rig
+    far = RigidTransform(pose.rotation, 1000.0 * pose.translation)
+    distance = np.linalg.norm(far.translation)
+    save_rig(folder / "far.yaml", [(FRONT.camera, RigidTransform.identity()), (ASIDE.camera, far)])
+    said = refused(*with_both_cameras(folder, tmp_path / "run", camera="far.yaml#cam0"))
+    assert f"camera 1: the object is not in its picture, by the pose of the camera, {distance:.4g} m" in said

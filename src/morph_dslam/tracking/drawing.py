@@ -373,7 +373,8 @@ def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults
         return view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps)
 
     # Frames that may be missing after those of the run are read ahead, but never asked for.
-    rows = zip(run.results, ahead(iter(source)), strict=False)
+    numbers = set(run.frames)  # another camera may lack some
+    rows = zip(run.results, ahead(frame for frame in source if frame.index in numbers), strict=False)
     with VideoWriter(path, source.fps, (camera.width, camera.height)) as video, threads_side_by_side():
         for image in tqdm(ahead(starmap(drawn, rows)), total=len(run), desc="drawing", unit="frame"):
             video.write(image)

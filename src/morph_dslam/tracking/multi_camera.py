@@ -86,6 +86,18 @@ class RigCamera:
         """The inverse of `seen`."""
         return replace(state, camera_from_object=self.camera_from_rig.inverse @ state.camera_from_object)
 
+    def not_seen(self, state: State, model: ReducedModel) -> str:
+        """That no node of the model, with the state in the rig's frame, is in this camera's image; empty if one is."""
+        camera = self.camera
+        pixels = camera.project(self.seen(state).camera_from_object.apply(model.positions(state.parameters)))
+        if ((pixels >= -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1).any():
+            return ""
+        distance = np.linalg.norm(self.camera_from_rig.translation)
+        return (
+            f"the object is not in its picture, by the pose of the camera, {distance:.4g} m from the first one: check "
+            "that the file has lengths in metres, and each camera as it stands to the one before it"
+        )
+
     def chain(self, n_parameters: int) -> Array:
         """(d + 6, d + 6) from increments in the rig's frame to those in the camera's."""
         rotation = self.camera_from_rig.rotation
@@ -335,7 +347,9 @@ class RigTracker:
                     keyframes=KeyframeViews(in_camera) if keyframes is None else keyframes[number],
                 )
             except RegistrationError as error:
-                raise RegistrationError(f"camera {number}: {error}") from error
+                raise RegistrationError(
+                    f"camera {number}: {part.not_seen(registration.state, model) or error}"
+                ) from error
             if tracker.reference.outline_alone:
                 raise RegistrationError(f"camera {number}: {NO_TEXTURE}")
             self.trackers.append(tracker)

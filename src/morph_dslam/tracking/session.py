@@ -162,22 +162,27 @@ class Session:
 class SynchronizedFrames:
     """What several cameras recorded, the frames of one instant after the other.
 
-    It ends with the shortest recording.
+    A frame that one of them lacks is left out, and a gap stays in the numbers. It ends with the shortest recording.
 
     Parameters
     ----------
-    sources : by camera, with the same frame numbers.
+    sources : by camera; frames of one instant have the same number, and all begin with the same one.
+
+    Attributes
+    ----------
+    n_left_out : number of instants in the last pass so far that a camera has no frame of.
     """
 
     def __init__(self, sources: Sequence[FrameSource]) -> None:
-        self.sources = tuple(sources)
+        self.sources, self.n_left_out = tuple(sources), 0
 
     def notices(self, n_tracked: int) -> list[RunNotice]:
-        """What a reader must know if not all recordings are as long."""
+        """What a reader must know if not all recordings have the same frames."""
         counts = [len(source) for source in self.sources]
-        if len(set(counts)) == 1:
+        if len(set(counts)) == 1 and not self.n_left_out:
             return []
-        return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, counts=", ".join(map(str, counts)), tracked=n_tracked)]
+        told = {"counts": ", ".join(map(str, counts)), "tracked": n_tracked, "left_out": self.n_left_out}
+        return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, **told)]
 
     @property
     def has_registered_depth(self) -> bool:
@@ -185,14 +190,35 @@ class SynchronizedFrames:
         return getattr(self.sources[0], "has_registered_depth", False)
 
     def __len__(self) -> int:
+        """Number of instants at most."""
         return min(len(source) for source in self.sources)
 
     def __iter__(self) -> Iterator[tuple[Frame, ...]]:
-        for frames in zip(*self.sources, strict=False):
-            if len({frame.index for frame in frames}) > 1:
-                numbers = ", ".join(str(frame.index) for frame in frames)
-                raise SourceError(
-                    f"the cameras' recordings do not go together: frames {numbers} come at the same time; number "
-                    "what was taken at one instant alike, or if one begins later, give --range from where all begin"
-                )
-            yield frames
+        readers = [iter(source) for source in self.sources]
+        self.n_left_out = 0
+        first = True
+        for frames in zip(*readers, strict=False):
+            together, skipped = list(frames), set[int]()
+            if first:
+                _check_begin(together)
+            first = False
+            while len({frame.index for frame in together}) > 1:
+                newest = max(frame.index for frame in together)
+                behind = [k for k, frame in enumerate(together) if frame.index < newest]
+                skipped.update(together[k].index for k in behind)
+                for k in behind:
+                    if (frame := next(readers[k], None)) is None:
+                        return
+                    together[k] = frame
+            self.n_left_out += len(skipped)
+            yield tuple(together)
+
+
+def _check_begin(frames: Sequence[Frame]) -> None:
+    """Raise SourceError if the first frames of cameras have not one number."""
+    if len({frame.index for frame in frames}) > 1:
+        numbers = ", ".join(str(frame.index) for frame in frames)
+        raise SourceError(
+            f"the cameras' recordings do not go together: they begin with frames {numbers}; number "
+            "what was taken at one instant alike, or if one begins later, give --range from where all begin"
+        )
