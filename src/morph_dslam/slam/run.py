@@ -31,6 +31,7 @@ from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camera, start_slam, track_frames
 from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, with_terms_of
 from morph_dslam.sources import FrameSource, open_source, open_stream
+from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.sources.recorded import RecordedFrames
 
@@ -122,6 +123,7 @@ def run_slam(
         if progress:
             print("preparing (half a minute the first time, when the inner loops are compiled) ...", file=sys.stderr)
         slam, frames = start_slam(stream, one_or_two, options, known, recorded), list[SlamFrame]()
+        notes = notes_of_source(stream)
         again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0
         size = (slam.camera.width, slam.camera.height)
@@ -148,12 +150,12 @@ def run_slam(
                 }
             if isinstance(stream, LiveStream):
                 more["n_dropped"] = stream.dropped - n_before
-            summary = write_run(output, finish_scene(slam, frames, again), more) if frames else {}
+            summary = write_run(output, finish_scene(slam, frames, again), more, notes) if frames else {}
     return summary
 
 
-def write_run(folder: Path, scene: Scene, more: dict[str, Any]) -> dict[str, Any]:
-    """Write all files but the video; returns the content of ``summary.json``, of which ``more`` is a part."""
+def write_run(folder: Path, scene: Scene, more: dict[str, Any], notes: Sequence[str] = ()) -> dict[str, Any]:
+    """Write all files but the video; returns the content of ``summary.json``, which has ``more`` and the notes."""
     save_trajectory(folder / "trajectory.txt", scene.trajectory)
     meshio.Mesh(scene.points, []).write(folder / "map.ply")
     _write_colmap(folder / "colmap", scene)
@@ -164,6 +166,7 @@ def write_run(folder: Path, scene: Scene, more: dict[str, Any]) -> dict[str, Any
     _plot_trajectory(plots / "trajectory.png", scene)
     _plot_frames(plots / "frames.png", scene.frames)
     summary = scene.summary() | more
+    summary["flags"] = [*notes, *summary["flags"]]
     (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
     return summary
 

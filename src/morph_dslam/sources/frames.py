@@ -17,6 +17,8 @@ from morph_dslam.io.file_kinds import IMAGES, content_kind, file_kind, named_kin
 
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
+#: How images of a camera are decoded: as they are stored, whatever their head says of how the camera was held.
+AS_RECORDED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 #: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
 _END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9"}
 
@@ -46,7 +48,8 @@ class Frame:
 class FrameStream(Protocol):
     """Frames one after the other, recorded or live.
 
-    One whose frames have depth that belongs to their pixels says so by ``has_registered_depth = True``.
+    One whose frames have depth that belongs to their pixels says so by ``has_registered_depth = True``; ``notes`` are
+    sentences that a reader of the results must know.
     """
 
     name: str
@@ -110,6 +113,19 @@ def has_registered_depth(source: FrameStream) -> bool:
     return bool(getattr(source, "has_registered_depth", False))
 
 
+def notes_of_source(source: object) -> tuple[str, ...]:
+    """What a reader of the results must know of the frames, in words."""
+    return tuple(getattr(source, "notes", ()))
+
+
+def orientation_note(name: str) -> str:
+    """What to know of a recording that other programs show turned."""
+    return (
+        f"{name} is marked to be shown turned, which is not done here: pixels are taken as the sensor recorded them, "
+        "and those of landmarks and of the camera file must be too (docs/sources.md)"
+    )
+
+
 def check_range(where: Path, available: range, first: int | None, last: int | None) -> tuple[int, int]:
     """The wanted range with its open ends filled in.
 
@@ -152,12 +168,20 @@ def image_files(folder: Path) -> list[Path]:
     return [path for path in files if named_kind(path) in IMAGES] or [f for f in files if file_kind(f) in IMAGES]
 
 
-def read_image(path: Path, what: str) -> NDArray[np.uint8]:
+def read_image(path: Path, what: str, as_shown: bool = False) -> NDArray[np.uint8]:
     """Read an image (h, w, 3) uint8 as blue, green, red.
+
+    Its pixels are as the sensor recorded them, which lens and rows of the camera belong to, whatever the file says of
+    how the camera was held; ``as_shown`` turns it so, for images that are not of the camera.
 
     Raises SourceError if the file is missing, cut short or not an image; the message begins with ``what``.
     """
-    return np.asarray(_decode(path, what, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return np.asarray(_decode(path, what, cv2.IMREAD_COLOR if as_shown else AS_RECORDED), dtype=np.uint8)
+
+
+def is_shown_turned(path: Path, what: str) -> bool:
+    """Whether other programs show an image otherwise than the sensor recorded it."""
+    return not np.array_equal(read_image(path, what), read_image(path, what, as_shown=True))
 
 
 def read_depth(path: Path, what: str, scale: DepthScale) -> NDArray[np.float32]:
@@ -191,6 +215,7 @@ NETWORK_TIMEOUT_MS = 10_000
 def open_capture(source: str | int, is_remote: bool = False) -> cv2.VideoCapture:
     """A video file, a webcam by its number, or what a URL leads to; see its ``isOpened()``.
 
+    Frames are not turned, so that lens and rows of the camera belong to them whatever the file says of how it was held.
     What OpenCV and FFmpeg print is kept away. What ``is_remote`` is given up if it is silent for `NETWORK_TIMEOUT_MS`.
     """
     # FFmpeg's log level AV_LOG_QUIET; it is read once, when the first video is opened.
@@ -200,11 +225,16 @@ def open_capture(source: str | int, is_remote: bool = False) -> cv2.VideoCapture
     before = log.getLogLevel()
     log.setLogLevel(0)
     try:
-        if not is_remote:
+        if isinstance(source, int):
             return cv2.VideoCapture(source)
-        limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
-        parameters = [number for limit in limits for number in (limit, NETWORK_TIMEOUT_MS)]
-        return cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, parameters)
+        if is_remote:
+            limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+            parameters = [number for limit in limits for number in (limit, NETWORK_TIMEOUT_MS)]
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, parameters)
+        else:
+            capture = cv2.VideoCapture(source)
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        return capture
     finally:
         log.setLogLevel(before)
 

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
 from morph_dslam.sources import frames as limits
-from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, open_capture
+from morph_dslam.sources.frames import (
+    Frame,
+    FrameStream,
+    frame_rate,
+    has_registered_depth,
+    notes_of_source,
+    open_capture,
+)
 from morph_dslam.sources.steady_times import SteadyTimes
 
 _LOG = logging.getLogger("morph_dslam")
@@ -273,7 +280,8 @@ class PacedRecording(LiveStream):
     ) -> None:
         super().__init__(source.name, source.fps)
         self._source, self._clock, self._sleep = source, clock, sleep
-        self.has_registered_depth = getattr(source, "has_registered_depth", False)
+        self.has_registered_depth = has_registered_depth(source)
+        self.notes = notes_of_source(source)
 
     def read(self) -> Iterator[Frame]:
         first: tuple[float, float] | None = None

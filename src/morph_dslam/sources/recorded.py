@@ -20,6 +20,8 @@ from morph_dslam.sources.frames import (
     check_range,
     check_size,
     image_files,
+    is_shown_turned,
+    orientation_note,
     read_depth,
     read_image,
 )
@@ -91,6 +93,12 @@ class RecordedFrames:
         """Whether frames come with depth that belongs to their pixels."""
         scale = self._depth_scale
         return scale is not None and scale.registered and any(r.depth is not None for r in self._records)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the results must know of the frames."""
+        first = self._records[0]
+        return (orientation_note(self.name),) if is_shown_turned(first.image, f"frame {first.index}") else ()
 
     def with_depth_per_metre(self, values: float) -> RecordedFrames:
         """The same frames, whose depth images have so many values a metre.

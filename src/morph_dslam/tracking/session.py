@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from morph_dslam.errors import ArgumentError, SourceError, check_kind
 from morph_dslam.sources import Frame
-from morph_dslam.sources.frames import FrameSource, check_frame
+from morph_dslam.sources.frames import FrameSource, check_frame, notes_of_source
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
@@ -183,6 +183,11 @@ class SynchronizedFrames:
             return []
         told = {"counts": ", ".join(map(str, counts)), "tracked": n_tracked, "left_out": self.n_left_out}
         return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, **told)]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the results must know of the recordings."""
+        return tuple(note for source in self.sources for note in notes_of_source(source))
 
     @property
     def has_registered_depth(self) -> bool:

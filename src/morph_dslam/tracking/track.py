@@ -25,7 +25,7 @@ from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.slam.camera_notes import camera_notes
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
-from morph_dslam.sources.frames import FrameSource, read_image
+from morph_dslam.sources.frames import FrameSource, notes_of_source, read_image
 from morph_dslam.sources.live import LiveStream, PacedRecording
 from morph_dslam.sources.local_socket import SocketCamera
 from morph_dslam.threads import one_thread_for_algebra
@@ -210,6 +210,7 @@ class _Job:
 
     def __init__(self, stack: ExitStack, run: TrackOptions, source: Any, placed: list[PlacedObject]) -> None:
         self._run, self._source, self._placed = run, source, placed
+        self._notes = notes_of_source(source)
         self._views = _views_of(placed, run)
         for folder in run.folders:
             stack.enter_context(only_writer(folder))
@@ -338,7 +339,7 @@ class _Job:
         facts = _facts(run, run.objects[number], part, folder.results)
         notices = [*part.registration.warnings, *self._again[part.name].notices]
         of_camera = camera_doubts(part.camera) if part.object.scene is None else part.object.scene.camera_notes
-        notices += [Remark(note) for note in of_camera]
+        notices += [Remark(note) for note in (*of_camera, *self._notes)]
         deforms, checked = bool(part.model.parameters), None
         if part.name in self._checks:
             checked = self._checks[part.name].estimate(deforms and _leaves_residuals(folder.results))
