@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.contact import RigidPlane
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
-from morph_dslam.mechanics.couplings import Coupling, Motion
+from morph_dslam.mechanics.couplings import Coupling, Motion, Rotation as CoupledRotation
 from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure
 from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchhoff
@@ -284,3 +284,9 @@ def test_couplings_share_no_nodes_and_hold_no_body() -> None:
         CoupledSolid([Coupling("x_max")], BAR, {"all": RUBBER})
     with pytest.raises(StudyError, match="free to move along z and to turn about y"):
         CoupledSolid([Coupling("x_max", held=("x", "y", "z", "rx", "rz"))], BAR, {"all": RUBBER})
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_iteration_that_winds_a_set_up_gets_no_numbers_and_no_warnings():
+    for far in (1e3, 1e80, np.inf):
+        assert np.isnan(CoupledRotation.of(np.array([0.0, far, 1.0])).matrix).all()

@@ -36,6 +36,8 @@ _NAMES: tuple[Motion, ...] = get_args(Motion)
 _CROSS: Array = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)
 #: a and b as power series in |t|^2; so many terms are exact beyond a full turn.
 _A, _B = (Polynomial([(-1.0) ** k / factorial(2 * k + first) for k in range(30)]) for first in (1, 2))
+#: Components of a rotation vector, rad, up to which powers of it are within the range of numbers.
+MOST_TURNED = 100.0
 #: A set whose extent across its longest direction is a smaller part of that lies on a line.
 LINE = 1e-6
 
@@ -81,9 +83,10 @@ class Rotation:
     curvatures: Array
 
     @staticmethod
-    @np.errstate(over="ignore", invalid="ignore")  # an iteration that diverges is told by values that are not finite
     def of(vector: Array) -> Rotation:
-        """Of a rotation vector (3,), rad."""
+        """Of a rotation vector (3,), rad; not a number where an iteration has turned it too far for the series."""
+        if not np.abs(vector).max() < MOST_TURNED:
+            vector = np.full(3, np.nan)
         square = float(vector @ vector)
         K = np.einsum("i,ijk->jk", vector, _CROSS)
         K_slopes, K_curvatures = _CROSS, np.zeros((3, 3, 3, 3))
