@@ -23,6 +23,9 @@ from morph_dslam.studies.solid_sections import CouplingSection, ForceLoad, Movin
 MOST_MODULI = 20.0
 #: Loads that would move a shell by more than so many times its size, were it linear, have probably a wrong unit.
 MOST_SIZES = 20.0
+#: Levers are rarely so many times as long as the body that they turn; a point given in metres for millimetres is far
+#: beyond that.
+MOST_LENGTHS = 10.0
 
 
 def load_doubt(
@@ -53,14 +56,14 @@ def load_doubt(
 
 
 def _point_doubt(where: str, section: CouplingSection, mesh: Mesh, parameters: Sequence[Parameter]) -> str:
-    """A sentence if a coupling's point is, at the defaults, farther from its set than the mesh is long; else ""."""
+    """A sentence if a coupling's point is, at the defaults, many lengths of the mesh away from its set; else ""."""
     if section.point is None:
         return ""
     defaults = np.array([parameter.default for parameter in parameters])
     point = np.array([read_affine(value, "length", parameters)(defaults) for value in section.point])
     distance = float(np.linalg.norm(mesh.nodes[mesh.set_nodes(section.on)] - point, axis=1).min())
     length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
-    if distance <= length:
+    if distance <= MOST_LENGTHS * length:
         return ""
     return (
         f"{where.capitalize()} has its point {1e3 * distance:.4g} mm from its set, where the mesh is "
