@@ -72,6 +72,20 @@ def test_a_bifurcation_that_was_passed_is_reported(tmp_path, capsys, load) -> No
     assert f"{len(beyond)} of 15 solutions are unstable; bifurcations" in capsys.readouterr().out
 
 
+def test_a_column_with_an_imperfection_bends_out_past_its_buckling_load(tmp_path) -> None:
+    """Bent inextensibly to a cosine it is shorter by (pi w / 2)^2 / length, beside what Euler's load compresses."""
+    (tmp_path / "study.toml").write_text(
+        COLUMN + '[[loads]]\nkind = "body_force"\nforce = ["1000 N/m3", "0 N/m3", "0 N/m3"]\n'
+    )
+    assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "column.morph")]) == 0
+    model = load_model(tmp_path / "column.morph")
+    assert model.certificate["stability"]["unstable"] == 0
+    for shortening in (0.02, 0.025):
+        deflection = model.at({"shortening": shortening}).displacement()[:, 0].max()
+        expected = 2.0 / np.pi * 0.15 * np.sqrt(shortening - EULER)
+        np.testing.assert_allclose(deflection, expected, rtol=0.07)
+
+
 SHIFT = Parameter("shift", "length", "mm", 0.0, 1.0, 0.0)
 SAMPLES = np.array([[0.001], [0.002], [0.003], [0.004]])
 

@@ -44,6 +44,11 @@ def test_a_load_past_the_limit_point_names_the_last_that_converged_and_keeps_it(
         assert truss_force(state.dofs[0]) == pytest.approx(state.mu[0], abs=1e-9)
 
 
+def test_a_path_whose_end_has_the_wrong_sign_is_refused() -> None:
+    with pytest.raises(SolverError, match="`end` is positive at the path's start"):
+        list(ArcLength(von_mises_truss(HEIGHT)).follow(at_rest(), lambda state: 0.01 - state.mu[0]))
+
+
 def test_imposed_motion_passes_where_a_load_cannot() -> None:
     """Through a spring of stiffness 1, stiffer than the truss is unstable, to beyond the truss' limit."""
     state = advance(von_mises_truss(HEIGHT, moved=True), at_rest(2), np.array([0.5]))[-1]

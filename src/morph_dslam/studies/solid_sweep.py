@@ -20,6 +20,7 @@ from morph_dslam.mechanics.solvers.continuation import (
     advance,
     loaded_state,
     refuse_passage,
+    stable_state,
 )
 from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
 from morph_dslam.mechanics.solvers.stability import unstable_directions
@@ -208,7 +209,8 @@ class SolidSweep:
 
     def first_state(self) -> _SolidState:
         """Equilibrium at the parameters' defaults, all loads grown together."""
-        return self._with_slopes(loaded_state(self.problem, self.problem.symbols.default))
+        found = self._with_slopes(loaded_state(self.problem, self.problem.symbols.default))
+        return found if self.problem.applied_first else self._stable(found)
 
     def pack(self, state: _SolidState) -> dict[str, Array]:
         pivots = -1 if state.negative_pivots is None else state.negative_pivots
@@ -236,7 +238,23 @@ class SolidSweep:
             refuse_passage(self.problem, State(start.mu, start.dofs), state)
         except SolverError:
             state = follow(self.problem, State(start.mu, start.dofs), target, self._found_farthest)
-        return self._with_slopes(state)
+        found = self._with_slopes(state)
+        return self._stable(found, State(start.mu, start.dofs)) if start.negative_pivots == 0 else found
+
+    def _stable(self, found: _SolidState, start: State | None = None) -> _SolidState:
+        """The solution that was found, or the stable one beside it that the path from a stable start leads to."""
+        if not found.negative_pivots:
+            return found
+        state = stable_state(self.problem, found.mu, start)
+        if state is None:
+            return found
+        if start is not None:
+            try:
+                refuse_passage(self.problem, start, state)
+            except SolverError:
+                return found
+        other = self._with_slopes(state)
+        return found if other.negative_pivots != 0 else other
 
     def _found_farthest(self, start: State, target: Array) -> Array:
         """`farthest_solved`, once in each direction of a single parameter: that takes as long as many solves."""

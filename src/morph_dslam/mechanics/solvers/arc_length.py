@@ -211,6 +211,9 @@ class ArcLength:
         """
         options = self.options
         point = self.begin(start, sense) if isinstance(start, State) else start
+        if end(point.state) > 0.0:
+            begin = where(self.equations, point.state.mu)
+            raise SolverError(f"`end` is positive at the path's start, {begin}: it has to grow through zero at the end")
         length = point.step or options.first
         yield point
         while True:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
+from morph_dslam.mechanics.solvers.arc_length import ArcLength, PathPoint
 from morph_dslam.mechanics.solvers.newton import (
     TOLERANCE,
     Equations,
@@ -31,6 +32,10 @@ AnyState = TypeVar("AnyState")
 MOST_DEGREE = 4
 #: The path is given up when an increment falls below this part of it, or of a stride.
 SMALLEST_INCREMENT = 1.0 / 64.0
+#: Points after which a path by arc length is given up.
+MOST_POINTS = 150
+#: Where it has passed a bifurcation, it is tried again in steps of this part, so many times.
+RETREAT, MOST_RETREATS = 0.25, 5
 LIMIT_POINT = (
     "A load that the body cannot carry (a limit point) needs arc length, or an imposed displacement in its place"
 )
@@ -292,3 +297,76 @@ def loaded_state(equations: Equations, mu: Array, start: Array | None = None, to
         start = np.zeros(equations.n_dofs) if first is None else loaded_state(first(), mu).dofs
     reached = advance(_LoadRamp(equations, mu, start), State(np.zeros(1), start), np.ones(1), tolerance)[-1]
     return State(np.array(mu, dtype=float), reached.dofs, reached.negative_pivots, reached.iterations)
+
+
+class _Line:
+    """Equations in one parameter: the share s of the straight line from parameters (d,) to others."""
+
+    def __init__(self, equations: Equations, begin: Array, end: Array) -> None:
+        self._equations, self._begin, self._way = equations, begin, end - begin
+        self.n_dofs, self.free, self.scale = equations.n_dofs, equations.free, equations.scale
+
+    def _at(self, mu: Array) -> Array:
+        return self._begin + mu[0] * self._way
+
+    def prescribed(self, mu: Array) -> Array:
+        return self._equations.prescribed(self._at(mu))
+
+    def prescribed_slopes(self, mu: Array) -> Array:
+        return (self._way @ self._equations.prescribed_slopes(self._at(mu)))[None]
+
+    def residual(self, x: Array, mu: Array) -> Array:
+        return self._equations.residual(x, self._at(mu))
+
+    def residual_slopes(self, x: Array, mu: Array) -> Array:
+        return (self._way @ self._equations.residual_slopes(x, self._at(mu)))[None]
+
+    def linearise(self, x: Array, mu: Array) -> Linearisation:
+        return self._equations.linearise(x, self._at(mu))
+
+
+def stable_state(equations: Equations, mu: Array, start: State | None = None) -> State | None:
+    """The equilibrium at ``mu`` (d,) that a body comes to in small steps, by arc length.
+
+    Parameters
+    ----------
+    equations : what is solved; nothing of it is applied first.
+    mu : (d,) parameters.
+    start : a stable solution; None for the undeformed body, from which all loads grow together.
+
+    Returns
+    -------
+    None where the path passes a bifurcation, so that a body may go more than one way, or does not lead to ``mu``.
+    """
+    dofs = np.zeros(equations.n_dofs) if start is None else start.dofs
+    path = _LoadRamp(equations, mu, dofs) if start is None else _Line(equations, start.mu, np.asarray(mu, dtype=float))
+    try:
+        point = _end_of_stable_path(ArcLength(path), State(np.zeros(1), dofs))
+        found = None if point is None else solve(path, np.ones(1), point.state)
+    except SolverError:
+        return None
+    return None if found is None else State(np.array(mu, dtype=float), found.dofs, found.negative_pivots)
+
+
+def _end_of_stable_path(arc: ArcLength, start: State) -> PathPoint | None:
+    """The point of a path where its parameter is 1; None if it is not reached, or a bifurcation lies before it."""
+
+    def end(state: State) -> float:
+        return state.mu[0] - 1.0
+
+    points, before, retreats = arc.follow(start, end), None, 0
+    for _ in range(MOST_POINTS):
+        point = next(points)
+        # Beyond a limit point the parameter falls while a pivot is negative; beyond a bifurcation it does not.
+        if point.state.negative_pivots and point.rate > 0.0:
+            if before is None or retreats == MOST_RETREATS:
+                return None
+            # With a small imperfection a long step misses the bend of the path.
+            retreats, before = retreats + 1, replace(before, step=RETREAT * point.step)
+            points = arc.follow(before, end)
+            next(points)
+        elif abs(end(point.state)) < 1e-6:
+            return point
+        else:
+            before = point
+    return None
