@@ -132,6 +132,8 @@ def test_a_map_made_with_another_lens_says_by_how_much(tmp_path):
         ),
         ([0.0, 0.1, 0.3, 0.2, 0.4], 0.0, ("the timestamps go back at frame 3",)),
         (np.arange(9) * 33_333_333.0, 0.02, ("3.33e+07 s apart", "nanoseconds")),
+        (np.arange(9) * 33.3, 0.02, ("readout_s", "did not count", "33.3 s apart")),
+        (np.arange(9) * 33.3, 0.0, ()),
         (np.arange(9) / 30.0, 0.33, ("readout_s", "0.33 s", "0.0333 s")),
         # A tenth above the time between frames is the error of an estimate.
         (np.arange(9) / 30.0, 0.0337, ()),

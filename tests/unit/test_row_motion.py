@@ -125,3 +125,23 @@ def test_a_frame_in_which_the_object_is_lost_ends_what_is_known():
     known.motion(0.0)
     known.add(None)
     assert known.motion(INTERVAL) is None
+
+
+@pytest.mark.parametrize(("gap", "is_used"), [(INTERVAL, True), (1e3 * INTERVAL, False), (1e-6, False)])
+def test_times_that_tell_nothing_of_the_motion_are_named(gap, is_used):
+    """Milliseconds, or stamps rounded to one; the first frame has none before it."""
+    known = StateHistory(CAMERA, np.zeros(3))
+    for frame in range(3):
+        motion = known.motion(gap * frame)
+        assert (motion is not None) == (is_used and frame > 0)
+        assert bool(known.warnings) == (not is_used and frame > 0)
+        known.add(state_at(0.0, (0.0, 0.0, 0.0)))
+    if not is_used:
+        assert known.warnings[0].gap_s == pytest.approx(gap)
+
+
+def test_a_frame_without_a_time_is_named_where_rows_have_times():
+    for camera, count in ((CAMERA, 1), (replace(CAMERA, readout_s=0.0), 0)):
+        known = StateHistory(camera, np.zeros(3))
+        assert known.motion(None) is None
+        assert len(known.warnings) == count

@@ -262,6 +262,42 @@ def test_names_that_are_times_give_order_and_timestamps(tmp_path, names, times):
     assert [frame.index for frame in open_source(tmp_path, 1, 1)] == [1]
 
 
+@pytest.mark.parametrize("parts", [10**3, 10**6, 10**9])
+@pytest.mark.parametrize(("start", "fps"), [(1_700_000_000, 30.0), (1_700_000_000, 5.0), (20_000_000_000, 240.0)])
+def test_the_unit_of_names_is_that_of_a_camera_s_rate(tmp_path, parts, start, fps):
+    """Milliseconds, microseconds and nanoseconds since 1970, or of another clock."""
+    taken = [start + k / fps for k in range(5)]
+    for time in taken:
+        cv2.imwrite(str(tmp_path / f"{int(time * parts)}.png"), grey(1))
+    source = open_source(tmp_path)
+    np.testing.assert_allclose([frame.timestamp for frame in source], taken, rtol=0, atol=1.001e-3)
+    assert source.fps == pytest.approx(fps, rel=0.05)
+    assert notes_of_source(source, readout_s=0.03) == ()
+
+
+def test_long_numbers_that_follow_each_other_are_those_of_frames(tmp_path):
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{2026010100000 + number}.png"), grey(1))
+    assert [frame.index for frame in open_source(tmp_path)] == [2026010100000, 2026010100001, 2026010100002]
+
+
+def test_the_rate_of_numbered_images_is_given(folder, tmp_path):
+    """Nothing else tells it; a rolling shutter counts by it."""
+    assumed = open_source(folder)
+    assert "30 a second are assumed" in notes_of_source(assumed, readout_s=0.03)[0]
+    assert notes_of_source(assumed) == ()
+    for opened in (open_source(folder, 2, 10, fps=15.0), open_stream(folder, 2, fps=15.0)):
+        assert [frame.timestamp for frame in opened] == pytest.approx([2 / 15, 3 / 15, 10 / 15])
+        assert opened.fps == 15.0
+        assert notes_of_source(opened, readout_s=0.03) == ()
+    with open_live(folder, fps=15.0) as live:
+        assert live.fps == 15.0
+    with pytest.raises(SourceError, match="fps is -1"):
+        open_source(folder, fps=-1)
+    with pytest.raises(SourceError, match=r"clip\.avi says the times of its frames itself: leave --fps out"):
+        open_source(make_video(tmp_path / "clip.avi", "MJPG"), fps=15.0)
+
+
 def test_the_rate_of_images_named_by_times_is_theirs(tmp_path):
     for number in range(4):
         cv2.imwrite(str(tmp_path / f"{1000.0 + 0.05 * number:.6f}.png"), grey(number))

@@ -68,6 +68,13 @@ def add_range(command: argparse._ActionsContainer, text: str) -> None:
     command.add_argument("--range", type=frame_range, default=(None, None), metavar="FIRST-LAST", help=text)
 
 
+def add_rate(command: argparse._ActionsContainer) -> None:
+    """Add ``--fps N``."""
+    command.add_argument(
+        "--fps", type=positive_number, metavar="N", help="frames a second of numbered images (default: 30)"
+    )
+
+
 def positive_number(text: str) -> float:
     """A number above zero, not infinite."""
     try:

@@ -2,7 +2,7 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, frame_number, positive_number
+from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, add_rate, frame_number, positive_number
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
 TERMS = ("focal", "centre", "radial", "tangential", "readout")
@@ -51,6 +51,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="estimate the focal length, the principal point, radial or tangential terms of the lens, the readout time "
         "of a rolling shutter, or all of them first, and write camera.yaml into the run folder; may be repeated",
     )
+    add_rate(command)
     command.add_argument(
         "--depth-per-metre",
         type=positive_number,
@@ -83,6 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
         images=arguments.images,
         refine=TERMS if "all" in arguments.refine_camera else tuple(dict.fromkeys(arguments.refine_camera)),
         depth_per_metre=arguments.depth_per_metre,
+        fps=arguments.fps,
         video=not arguments.no_video,
         overwrite=arguments.overwrite,
     )

@@ -268,6 +268,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         others=tuple(others),
         first=first,
         last=last,
+        fps=arguments.fps,
         output=arguments.output,
         overwrite=arguments.overwrite,
         video=not arguments.no_video,

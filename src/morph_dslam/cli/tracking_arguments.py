@@ -11,6 +11,7 @@ from morph_dslam.cli.arguments import (
     add_flag,
     add_output,
     add_range,
+    add_rate,
     add_repeated,
     frame_and_file,
     named_place,
@@ -59,6 +60,7 @@ def _add_inputs(group: _Group, required: bool) -> None:
     add_file(group, "--model", "model file of `morph build`", "MODEL", required)
     add_file(group, "--camera", "camera file: size, intrinsics, distortion", "CAMERA", required)
     add_range(group, "frames to track, of a recording")
+    add_rate(group)
     group.add_argument(
         "--also",
         nargs=3,

@@ -55,6 +55,7 @@ def run_slam(
     images: Path | None = None,
     refine: Sequence[CameraTerm] = (),
     depth_per_metre: float | None = None,
+    fps: float | None = None,
     video: bool = True,
     overwrite: bool = False,
     progress: bool = True,
@@ -76,6 +77,7 @@ def run_slam(
     trajectory : file of poses to make the map with instead
     images : recording that the model or the trajectory belongs to; the source by default
     refine : terms of the camera to estimate before; the camera goes into the run folder, ``camera.yaml``
+    fps : frames a second of numbered images, which nothing else tells
     depth_per_metre : values a metre of the depth images; as its layout has them by default
     video : draw the video with the points followed
     overwrite : replace a run that is there already
@@ -98,7 +100,7 @@ def run_slam(
         raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
     if refine and (map_path is not None or trajectory is not None):
         raise MapError("--refine-camera makes a new map: leave out --map and --trajectory")
-    one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last)
+    one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last, fps)
     if depth_per_metre is not None:
         if not isinstance(stream, RecordedFrames):
             raise SourceError(f"{source} has no depth images: leave --depth-per-metre out")
@@ -119,11 +121,13 @@ def run_slam(
             known = load_trajectory(trajectory)
         elif map_path is not None:
             known = read_colmap_model(map_path) if is_model else load_scene(map_path, FrameImages(one_or_two).camera)
-        recorded = open_source(images or source) if isinstance(known, Trajectory | ColmapModel) else None
+        recorded = None
+        if isinstance(known, Trajectory | ColmapModel):
+            recorded = open_source(images or source, fps=None if images else fps)
         if progress:
             print("preparing (half a minute the first time, when the inner loops are compiled) ...", file=sys.stderr)
         slam, frames = start_slam(stream, one_or_two, options, known, recorded), list[SlamFrame]()
-        notes = notes_of_source(stream)
+        notes = notes_of_source(stream, slam.camera.readout_s)
         again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0
         size = (slam.camera.width, slam.camera.height)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.slam.result import NoPose, SlamFrame, SlamReason, SlamStatus
-from morph_dslam.slam.rolling_shutter import LEAST_GAP_S
+from morph_dslam.slam.rolling_shutter import LEAST_GAP_S, MOST_GAP_S
 from morph_dslam.slam.slam import Slam
 from morph_dslam.sources.recorded import DEPTH_SCALE
 
@@ -65,6 +65,11 @@ def time_notes(frames: Sequence[SlamFrame], readout_s: float = 0.0) -> Iterator[
             "and microseconds by 1e6"
         )
         return
+    if readout_s and interval >= MOST_GAP_S:
+        yield (
+            f"readout_s of the camera file did not count: the frames are {interval:.3g} s apart by their timestamps, "
+            f"which are seconds, and frames more than {MOST_GAP_S:g} s apart do not tell how fast the camera moves"
+        )
     numbers = np.array([frame.index for frame in frames[1:]])
     same, back = np.abs(gaps) < LEAST_GAP_S, gaps <= -LEAST_GAP_S
     if same.any():

@@ -11,6 +11,7 @@ from morph_dslam.sources.frames import CheckedSource, CheckedStream, Frame, Fram
 from morph_dslam.sources.live import LiveStream, PacedRecording, is_camera, open_camera
 from morph_dslam.sources.local_socket import open_socket
 from morph_dslam.sources.recorded import (
+    RecordedFrames,
     euroc_recording,
     image_folder,
     is_euroc,
@@ -40,7 +41,9 @@ def register_source(matches: Matches, open: Open) -> None:
     _KINDS.insert(0, (matches, open))
 
 
-def open_stream(source: str | Path, first: int | None = None, last: int | None = None) -> FrameStream:
+def open_stream(
+    source: str | Path, first: int | None = None, last: int | None = None, fps: float | None = None
+) -> FrameStream:
     """Open a recording as `open_source` does, or a camera: `webcam:0`, `/dev/video0`, or a URL such as `rtsp://address`.
 
     A recording gives every frame, however long each takes; a camera gives the newest and drops the others.
@@ -55,10 +58,21 @@ def open_stream(source: str | Path, first: int | None = None, last: int | None =
     for matches, open_kind in _KINDS:
         if matches(path):
             stream = open_kind(path, first, last)
+            if fps is not None:
+                stream = _with_rate(stream, fps)
             return stream if open_kind in _BUILT_IN else _checked(stream, path)
     raise SourceError(
         f"there is no folder of images and no video at {path} (cameras are webcam:0, /dev/video0 or a URL)"
     )
+
+
+def _with_rate(stream: FrameStream, fps: float) -> FrameStream:
+    """The same frames, so many a second; SourceError if they have times of their own."""
+    if isinstance(stream, RecordedFrames):
+        return stream.with_rate(fps)
+    if isinstance(stream, LiveStream):
+        stream.close()
+    raise SourceError(f"{stream.name} says the times of its frames itself: leave --fps out")
 
 
 def _checked(stream: FrameStream, path: Path) -> FrameStream:
@@ -74,21 +88,24 @@ def _checked(stream: FrameStream, path: Path) -> FrameStream:
     return CheckedSource(stream) if isinstance(stream, FrameSource) else CheckedStream(stream)
 
 
-def open_source(path: str | Path, first: int | None = None, last: int | None = None) -> FrameSource:
+def open_source(
+    path: str | Path, first: int | None = None, last: int | None = None, fps: float | None = None
+) -> FrameSource:
     """Open a recording.
 
     Parameters
     ----------
     path : a folder of images, whose frames are numbered by the last number in each file name (`001.jpg` is
-        frame 1), or from 0 if all names are times (`1305031100.5.png`, in seconds, or 16 digits or more, in
-        nanoseconds); a folder in the layout of TUM RGB-D, EuRoC or 7-Scenes; a video file, or a ROS 1 or ROS 2
-        bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
+        frame 1), or from 0 if all names are times (`1305031100.5.png`, in seconds, or 13 digits or more, in
+        milli-, micro- or nanoseconds); a folder in the layout of TUM RGB-D, EuRoC or 7-Scenes; a video file, or a
+        ROS 1 or ROS 2 bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
     first, last : range of frame numbers, both included; open ends by default
+    fps : frames a second of numbered images, which nothing else tells; 30 by default
 
     Raises SourceError if the path is missing, holds no frames, or does not reach ``first`` or ``last``. While
     iterating: if a frame cannot be decoded, changes size, or the video ends early; all frames before it come first.
     """
-    stream = open_stream(path, first, last)
+    stream = open_stream(path, first, last, fps)
     if isinstance(stream, LiveStream):
         stream.close()
         raise SourceError(f"{path} is live; a recording is needed here")
@@ -97,20 +114,23 @@ def open_source(path: str | Path, first: int | None = None, last: int | None = N
     return stream
 
 
-def open_live(source: str | Path, first: int | None = None, last: int | None = None) -> LiveStream:
+def open_live(
+    source: str | Path, first: int | None = None, last: int | None = None, fps: float | None = None
+) -> LiveStream:
     """Open a camera, or a recording that plays as if it were live: frames that come too fast are dropped.
 
     Parameters
     ----------
     source : `webcam:0` for the first webcam, `/dev/video0`, the URL of a camera on the network, or a recording
     first, last : range of frame numbers of a recording, both included
+    fps : frames a second of numbered images, which nothing else tells; 30 by default
 
     Raises
     ------
     SourceError
         If there is no such source, or it cannot be opened.
     """
-    stream = open_stream(source, first, last)
+    stream = open_stream(source, first, last, fps)
     return stream if isinstance(stream, LiveStream) else PacedRecording(stream)
 
 

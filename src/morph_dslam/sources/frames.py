@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -74,6 +75,16 @@ def check_frame(frame: object, before: Frame | None, source: str) -> None:
         raise SourceError(f"{source} gives an object of type {type(frame).__name__} {after}: give md.Frame objects")
     if before is not None and not frame.index > before.index:
         raise SourceError(f"{source} gives frame {frame.index} {after}: number frames in the order in which they come")
+    check_time(frame, f"{source}: frame {frame.index}")
+
+
+def check_time(frame: Frame, what: str) -> None:
+    """Raise SourceError unless a frame's time is a number; the message begins with ``what``."""
+    time: object = frame.timestamp
+    if time is None:
+        raise SourceError(f"{what} has no timestamp: give its time in seconds")
+    if not isinstance(time, Real) or not np.isfinite(float(time)):
+        raise SourceError(f"{what} has the timestamp {time!r}: give its time in seconds, as a finite number")
 
 
 class CheckedStream:
@@ -113,9 +124,16 @@ def has_registered_depth(source: FrameStream) -> bool:
     return bool(getattr(source, "has_registered_depth", False))
 
 
-def notes_of_source(source: object) -> tuple[str, ...]:
-    """What a reader of the results must know of the frames, in words."""
-    return tuple(getattr(source, "notes", ()))
+def notes_of_source(source: object, readout_s: float = 0.0) -> tuple[str, ...]:
+    """What a reader of the results must know of the frames, in words; with the readout time of their camera."""
+    notes = tuple(getattr(source, "notes", ()))
+    if not readout_s or not getattr(source, "has_assumed_times", False):
+        return notes
+    return (
+        *notes,
+        f"nothing tells the times of the frames: {ASSUMED_FPS:g} a second are assumed, and readout_s of the camera "
+        "file counts by them, as does what is said of the camera; give the right number with --fps",
+    )
 
 
 def orientation_note(name: str) -> str:

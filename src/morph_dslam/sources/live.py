@@ -281,6 +281,7 @@ class PacedRecording(LiveStream):
         super().__init__(source.name, source.fps)
         self._source, self._clock, self._sleep = source, clock, sleep
         self.has_registered_depth = has_registered_depth(source)
+        self.has_assumed_times = getattr(source, "has_assumed_times", False)
         self.notes = notes_of_source(source)
 
     def read(self) -> Iterator[Frame]:

@@ -37,9 +37,11 @@ MOST_TIME_DIFFERENCE = 0.02
 SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
 #: 7-Scenes carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
-#: Names of images that are times: seconds with a fraction as of TUM RGB-D, or nanoseconds as of EuRoC. Numbers of
-#: frames have fewer digits.
-_SECONDS, _NANOSECONDS = re.compile(r"\d+\.\d+", re.ASCII), re.compile(r"\d{16,}", re.ASCII)
+#: Names of images that are times: seconds with a fraction as of TUM RGB-D, or whole parts of a second, nanoseconds as
+#: of EuRoC. Numbers of frames have fewer digits.
+_SECONDS, _PARTS = re.compile(r"\d+\.\d+", re.ASCII), re.compile(r"\d{13,}", re.ASCII)
+#: Parts a second that whole numbers may count: milliseconds, microseconds or nanoseconds.
+_UNITS = (10**3, 10**6, 10**9)
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")
 
 
@@ -64,7 +66,13 @@ class RecordedFrames:
     first, last : range of frame numbers, both included; open ends by default
     depth_scale : how depth is stored
     fps : frames per second; from the timestamps where it is not given
+
+    Attributes
+    ----------
+    has_assumed_times : whether nothing tells the times, which then go by numbers of frames and `ASSUMED_FPS`.
     """
+
+    has_assumed_times = False
 
     def __init__(
         self,
@@ -111,6 +119,17 @@ class RecordedFrames:
             )
         other = copy(self)
         other._depth_scale = replace(self._depth_scale, values_per_metre=values)
+        return other
+
+    def with_rate(self, fps: float) -> RecordedFrames:
+        """The same frames, so many a second. Raises SourceError if they have times of their own."""
+        if not fps > 0.0 or not np.isfinite(fps):
+            raise SourceError(f"fps is {fps}: give the number of frames a second")
+        if not self.has_assumed_times:
+            raise SourceError(f"{self.name} says the times of its frames itself: leave --fps out")
+        other = copy(self)
+        other.fps, other.has_assumed_times = fps, False
+        other._records = [replace(record, timestamp=record.index / fps) for record in self._records]
         return other
 
     def __len__(self) -> int:
@@ -181,7 +200,9 @@ def image_folder(folder: Path, first: int | None = None, last: int | None = None
         in_turn = [_ImageRecord(index, timestamp, path) for index, (timestamp, path) in enumerate(timed)]
         return RecordedFrames(folder, in_turn, first, last)
     records = [_ImageRecord(number, number / ASSUMED_FPS, path) for number, path in numbered_images(folder).items()]
-    return RecordedFrames(folder, records, first, last, fps=ASSUMED_FPS)
+    source = RecordedFrames(folder, records, first, last, fps=ASSUMED_FPS)
+    source.has_assumed_times = True
+    return source
 
 
 def _timed_images(folder: Path) -> list[tuple[float, Path]]:
@@ -191,7 +212,7 @@ def _timed_images(folder: Path) -> list[tuple[float, Path]]:
     """
     # What is no ending of images is a part of the name.
     names = {path: path.stem if named_kind(path) in IMAGES else path.name for path in image_files(folder)}
-    kind = next((kind for kind in (_SECONDS, _NANOSECONDS) if all(map(kind.fullmatch, names.values()))), None)
+    kind = next((kind for kind in (_SECONDS, _PARTS) if all(map(kind.fullmatch, names.values()))), None)
     if kind is None:
         return []
     # Decimals are exact; float64 would round nanoseconds.
@@ -204,8 +225,21 @@ def _timed_images(folder: Path) -> list[tuple[float, Path]]:
                 "if their names are no times, number the images without a point"
             )
         images[time] = path
-    unit = 1 if kind is _SECONDS else 10**9
-    return [(float(time / unit), images[time]) for time in sorted(images)]
+    times = sorted(images)
+    unit = 1 if kind is _SECONDS else _parts_a_second(times)
+    return [(float(time / unit), images[time]) for time in times] if unit else []
+
+
+def _parts_a_second(times: Sequence[Decimal]) -> int | None:
+    """What whole numbers count: that by which there are 1 to 1000 frames a second; None where they are no times.
+
+    Where this does not tell, those of 16 digits are nanoseconds, and others the numbers of frames.
+    """
+    gaps = np.diff(np.array([int(time - times[0]) for time in times], dtype=np.float64))
+    gap = float(np.median(gaps)) if len(gaps) else 0.0
+    if gap <= 1.0:
+        return _UNITS[-1] if times[-1] >= 10**15 else None
+    return next((unit for unit in _UNITS if gap <= unit), _UNITS[-1])
 
 
 def is_tum(folder: Path) -> bool:

@@ -219,6 +219,25 @@ class DepthNotUsed(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class ReadoutNotUsed(TrackingWarning):
+    """The camera has a readout time, which did not count: the frame's time does not tell how the object moves.
+
+    Attributes
+    ----------
+    gap_s : time since the frame before, seconds; None where the frame has no time.
+    """
+
+    gap_s: float | None = None
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        if self.gap_s is None:
+            return "readout_s does not count: the frame has no time"
+        return f"readout_s does not count: the frame before is {self.gap_s:.3g} s ago; are the times in seconds?"
+
+
+@dataclass(frozen=True)
 class CameraIgnored(TrackingWarning):
     """One of several cameras does not count in this frame.
 

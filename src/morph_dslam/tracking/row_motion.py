@@ -20,6 +20,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.registration.rectification import rectified_image
 from morph_dslam.slam.rolling_shutter import LEAST_GAP_S, MOST_GAP_S, after, row_times, twist_of
+from morph_dslam.tracking.outcomes import ReadoutNotUsed
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
@@ -127,15 +128,24 @@ class StateHistory:
         self._camera, self._centre = camera, centre
         self._states: deque[tuple[float, State]] = deque(maxlen=2)
         self._now: float | None = None
+        self._not_used: ReadoutNotUsed | None = None
+
+    @property
+    def warnings(self) -> tuple[ReadoutNotUsed, ...]:
+        """Of the frame that was asked for last: that its time did not tell how the object moves."""
+        return () if self._not_used is None else (self._not_used,)
 
     def motion(self, timestamp: float | None) -> RowMotion | None:
         """How the object moves in the next frame, whose time is given, seconds; None where nothing tells of it."""
-        self._now = timestamp
+        self._now, self._not_used = timestamp, None
+        if self._camera.readout_s and timestamp is None:
+            self._not_used = ReadoutNotUsed()
         if not self._camera.readout_s or timestamp is None or not self._states:
             return None
         gaps = np.array([timestamp - then for then, _ in self._states])
         between = np.diff(gaps, prepend=0.0)
         if not LEAST_GAP_S <= between[0] < MOST_GAP_S:
+            self._not_used = ReadoutNotUsed(float(between[0]))
             return None
         n_used = 2 if len(gaps) == 2 and LEAST_GAP_S <= between[1] < MOST_GAP_S else 1
         states = [state for _, state in self._states]

@@ -22,6 +22,7 @@ from morph_dslam.tracking.outcomes import (
     FewPointsAgree,
     ModelDoesNotExplain,
     ObjectMoved,
+    ReadoutNotUsed,
     Status,
     TrackingWarning,
 )
@@ -80,6 +81,10 @@ class RunWarning(StrEnum):
     DEPTH_NOT_USED = (
         "the depth images did not count in {count} of {n_frames} frames, first in frame {first}, where they show "
         "nothing of the object or put it elsewhere (check their scale); the reasons are in frames.csv"
+    )
+    READOUT_NOT_USED = (
+        "readout_s of the camera file did not count in {count} of {n_frames} frames, which have no times in seconds "
+        "that tell how the object moves (frames.csv): correct their times, or film with more frames a second"
     )
     DOUBTFUL_FIELDS = (
         "the model misses {errors} at held-out solutions of its study: do not rely on these here, "
@@ -181,6 +186,9 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
             camera=number,
         )
     tell(_warned(run, DepthNotUsed), kind.DEPTH_NOT_USED)
+    without_rows = _warned(run, ReadoutNotUsed)
+    if 2 * len(without_rows) > len(run):
+        tell(without_rows, kind.READOUT_NOT_USED)
     tell(_warned(run, FewPointsAgree), kind.FEW_AGREE)
     largest = float(np.nanmax(run.unexplained_px(), initial=0.0))
     fails = kind.MODEL_FAILS if run.model.parameters else kind.RIGID_FAILS

@@ -190,6 +190,11 @@ class SynchronizedFrames:
         return tuple(note for source in self.sources for note in notes_of_source(source))
 
     @property
+    def has_assumed_times(self) -> bool:
+        """Whether nothing tells the times of the first camera's frames, which count."""
+        return getattr(self.sources[0], "has_assumed_times", False)
+
+    @property
     def has_registered_depth(self) -> bool:
         """Whether the first camera's frames come with depth that belongs to their pixels."""
         return getattr(self.sources[0], "has_registered_depth", False)

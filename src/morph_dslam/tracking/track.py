@@ -161,13 +161,13 @@ def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
     def frames_at(number: int | None) -> tuple[Frame, ...]:
         return tuple(frame_at(path, run.first if number is None else number) for path in paths)
 
-    sources = [open_source(path, run.first, run.last) for path in paths]
+    sources = [open_source(path, run.first, run.last, run.fps) for path in paths]
     return (SynchronizedFrames(sources) if run.other_cameras else sources[0]), frames_at
 
 
 def _open_live(run: TrackOptions, stack: ExitStack) -> tuple[Source, FramesAt]:
     """The stream to track, and what gives its reference: an image, or its first frame."""
-    stream = stack.enter_context(open_live(run.frames, run.first, run.last))
+    stream = stack.enter_context(open_live(run.frames, run.first, run.last, run.fps))
 
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
@@ -210,7 +210,7 @@ class _Job:
 
     def __init__(self, stack: ExitStack, run: TrackOptions, source: Any, placed: list[PlacedObject]) -> None:
         self._run, self._source, self._placed = run, source, placed
-        self._notes = notes_of_source(source)
+        self._notes = notes_of_source(source, placed[0].camera.readout_s)
         self._views = _views_of(placed, run)
         for folder in run.folders:
             stack.enter_context(only_writer(folder))
@@ -337,9 +337,9 @@ class _Job:
         if not len(folder.results):
             return {}
         facts = _facts(run, run.objects[number], part, folder.results)
-        notices = [*part.registration.warnings, *self._again[part.name].notices]
+        notices = [*part.registration.warnings, *self._again[part.name].notices, *map(Remark, self._notes)]
         of_camera = camera_doubts(part.camera) if part.object.scene is None else part.object.scene.camera_notes
-        notices += [Remark(note) for note in (*of_camera, *self._notes)]
+        notices += [Remark(note) for note in of_camera]
         deforms, checked = bool(part.model.parameters), None
         if part.name in self._checks:
             checked = self._checks[part.name].estimate(deforms and _leaves_residuals(folder.results))

@@ -392,7 +392,7 @@ class Tracker:
     ) -> FrameResult:
         """Status, estimate with all known errors in its covariance, and warnings."""
         number, has_moved = self._view.number, self._anchoring.has_moved
-        warnings = warnings_of_place(has_moved, self.jumps, number, camera.why_lost)
+        warnings = (*self._history.warnings, *warnings_of_place(has_moved, self.jumps, number, camera.why_lost))
         if rejection is not None:
             placed = self._placed_by_map(camera)
             result = lost_result(self.model, hypothesis, rejection, placed, warnings)

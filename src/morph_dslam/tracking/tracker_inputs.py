@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import ArgumentError, RegistrationError, SourceError, TrackingError, check_kind
+from morph_dslam.errors import ArgumentError, RegistrationError, TrackingError, check_kind
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
+from morph_dslam.sources.frames import check_time
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NO_MAP, TrackerOptions
 from morph_dslam.tracking.patches import normalize_contrast
@@ -121,13 +122,12 @@ class Picture:
         CameraError
             If the image is not one of the camera's, or the depth, if it is to be used, is not one that belongs to it.
         SourceError
-            If a frame has no time.
+            If a frame's time is no number.
         """
         if not isinstance(frame, Frame):
             return cls(camera.checked_picture(frame, "the frame"))
         where = f"frame {frame.index}"
-        if frame.timestamp is None:
-            raise SourceError(f"{where} has no timestamp: give its time in seconds")
+        check_time(frame, where)
         depth = frame.depth if use_depth else None
         if depth is not None:
             camera.check_depth(depth, f"the depth of {where}")
