@@ -177,6 +177,25 @@ def test_truncated_video_gives_its_frames_and_then_the_break(tmp_path):
     assert f"frame {len(frames)}," in str(caught.value)
 
 
+def test_a_video_whose_edit_list_leaves_frames_out_is_whole(tmp_path):
+    """As `ffmpeg -ss` cuts it: the edit begins at the sixth frame (ISO 14496-12, 8.6.6); one cut short is refused."""
+    path = make_video(tmp_path / "clip.mp4", "mp4v")
+    data = bytearray(path.read_bytes())
+    scale = struct.unpack(">I", data[data.index(b"mdhd") + 16 : data.index(b"mdhd") + 20])[0]
+    start = data.index(b"elst") + 12
+    movie = struct.unpack(">I", data[data.index(b"mvhd") + 16 : data.index(b"mvhd") + 20])[0]
+    data[start : start + 8] = struct.pack(">Ii", movie * 7 // 25, scale * 5 // 25)
+    path.write_bytes(data)
+    frames = list(open_source(path))
+    assert 0 < len(frames) < 12
+    assert frames[-1].index == len(frames) - 1
+    with pytest.raises(SourceError, match=rf"clip\.mp4 ends with frame {len(frames) - 1}: choose a range"):
+        list(open_source(path, 0, 11))
+    path.write_bytes(data + struct.pack(">I", 1000) + b"mdat")
+    with pytest.raises(SourceError, match=r"clip\.mp4 breaks off at frame"):
+        list(open_source(path))
+
+
 def test_video_without_its_index_cannot_be_opened(tmp_path):
     path = make_video(tmp_path / "clip.mp4", "mp4v")
     data = path.read_bytes()

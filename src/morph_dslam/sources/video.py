@@ -14,6 +14,8 @@ from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capt
 
 #: Containers that only estimate their length from its duration are off by so many frames without damage.
 LENGTH_TOLERANCE = 1
+#: Containers that declare the number of frames; an edit list of an mp4 file may leave some of them out.
+_COUNTED = (".mp4", ".mov", ".avi")
 
 
 def _open(path: Path) -> cv2.VideoCapture:
@@ -29,19 +31,37 @@ def _open(path: Path) -> cv2.VideoCapture:
 def _count_and_rate(path: Path, capture: cv2.VideoCapture) -> tuple[int, float]:
     """The declared number of frames and their rate; counted, and taken from the times, where they are not declared.
 
-    Matroska and WebM, which browsers record, declare a duration alone: where frames were dropped, OpenCV's count is
-    wrong.
+    Matroska and WebM, which browsers record, and MPEG streams have a duration alone: where frames were dropped,
+    OpenCV's count is wrong.
     """
-    is_matroska = file_kind(path) == ".mkv"
     count, fps = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0), frame_rate(capture)
-    if count and not is_matroska:
+    has_count = file_kind(path) in _COUNTED
+    if count and has_count:
         return count, fps
     count, last = 0, 0.0
     while capture.grab():
         count, last = count + 1, 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
     if count == 0:
         raise SourceError(f"{path} holds no frames")
-    return count, (count - 1) / last if is_matroska and count > 1 and last > 0.0 else fps
+    return count, (count - 1) / last if not has_count and count > 1 and last > 0.0 else fps
+
+
+def _is_cut_short(path: Path) -> bool:
+    """Whether the boxes of an mp4 file (ISO 14496-12), or the chunks of an AVI file, reach beyond its end."""
+    is_avi, size, start = file_kind(path) == ".avi", path.stat().st_size, 0
+    with path.open("rb") as file:
+        while start + 8 <= size:
+            file.seek(start)
+            head = file.read(16)
+            length = 8 + int.from_bytes(head[4:8], "little") if is_avi else int.from_bytes(head[:4], "big")
+            if not is_avi and length == 0:
+                return False  # it reaches to the end of the file
+            if not is_avi and length == 1:
+                length = int.from_bytes(head[8:16], "big")
+            if length < 8 or start + length > size:
+                return True
+            start += length + (length % 2 if is_avi else 0)
+    return False
 
 
 class VideoFile:
@@ -82,8 +102,12 @@ class VideoFile:
 
     def _check_end(self, index: int) -> None:
         """Raise SourceError unless the stream may well end before frame ``index``."""
-        if self._open_ended and index > 0 and self._declared - index <= LENGTH_TOLERANCE:
+        near = self._declared - index <= LENGTH_TOLERANCE
+        is_whole = file_kind(self._path) in _COUNTED and not _is_cut_short(self._path)
+        if self._open_ended and index > 0 and (near or is_whole):
             return
+        if index > 0 and is_whole:
+            raise SourceError(f"{self._path} ends with frame {index - 1}: choose a range of frames up to that")
         raise SourceError(
             f"{self._path} breaks off at frame {index}, though it declares {self._declared} frames: "
             "it is cut short or damaged; copy it again, or choose a range of frames before the break"
