@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from morph_dslam.mechanics.contact import RigidCylinder, RigidObstacle, RigidPlane, RigidSphere
+from morph_dslam.mechanics.loads import DeadTraction
 from morph_dslam.mechanics.materials.isotropic import LinearElastic, StVenantKirchhoff
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidProblem
+from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.newton import sensitivities
 from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.meshes import Mesh
@@ -111,3 +114,42 @@ def test_point_contact_of_hertz() -> None:
     radius = (3.0 * load * RADIUS / (4.0 * PLANE_STRAIN)) ** (1.0 / 3.0)
     assert np.sqrt(5.0 * found.square) == pytest.approx(radius, rel=0.02)
     assert found.peak == pytest.approx(3.0 * load / (2.0 * np.pi * radius**2), rel=0.02)
+
+
+CONFINED = StVenantKirchhoff(young=YOUNG, poisson=0.4998)
+
+
+@pytest.mark.parametrize("pushed", ["support", "obstacle", "load"])
+@pytest.mark.parametrize("cell_type", ["hex8", "tet10"])
+def test_confined_block(cell_type: str, pushed: str) -> None:
+    """Without room to bulge, P = l (K + 4 G / 3) (l^2 - 1) / 2: 800 times as stiff as with it.
+
+    Two of six walls are planes; with one more where the block is pushed by an obstacle. Derivatives are compared with
+    differences.
+    """
+    symbols = load_parameter(push=0.0)
+    mesh = block((0.2, 1.0, 0.2), (3, 4, 3), cell_type)
+    confined = YOUNG * (1.0 - 0.4998) / ((1.0 + 0.4998) * (1.0 - 2.0 * 0.4998))
+    push, stretch = 2e-3, 0.99
+    pressure = -stretch * confined * (stretch**2 - 1.0) / 2.0
+    walls: list[RigidObstacle] = [
+        RigidPlane("x_max", (0.2, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+        RigidPlane("y_max", (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)),
+    ]
+    supports, loads = list(ROLLERS), []
+    if pushed == "support":
+        supports.append(PrescribedDisplacement("z_max", z=-symbols["push"]))
+    elif pushed == "obstacle":
+        walls.append(RigidPlane("z_max", (0.0, 0.0, 0.2 - symbols["push"]), (0.0, 0.0, -1.0)))
+    else:
+        loads.append(DeadTraction("z_max", (0.0, 0.0, -symbols["push"] / push * pressure)))
+    problem = SolidProblem(mesh, {"all": CONFINED}, supports, loads, symbols, contacts=walls)
+    state = solved(problem, push)
+    below = problem.reactions(state.dofs, state.mu, "z_min")[0][2]
+    down = -problem.nodal_displacement(state.dofs)[mesh.set_nodes("z_max"), 2].mean()
+    assert below == pytest.approx(0.2 * pressure, rel=0.02)
+    assert down == pytest.approx(push, rel=0.02)
+    other = advance(problem, state, np.array([1.02 * push]))[-1]
+    differences = (other.dofs - state.dofs) / (0.02 * push)
+    slopes = sensitivities(problem, state)[0]
+    np.testing.assert_allclose(slopes, differences, atol=1e-3 * np.abs(slopes).max())

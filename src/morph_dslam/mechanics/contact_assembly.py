@@ -6,7 +6,8 @@ The gap g of a deformed point is its distance from what it may touch, negative w
 
 on the undeformed surface, whose derivative is the pressure eps |g| along the normal (Wriggers, Computational Contact
 Mechanics, 2006, section 6.3). The stiffness eps is `STIFFNESS` times Young's modulus over the width of an element's
-face, so that a surface gives way by a small part of that width.
+face, so that a surface gives way by a small part of that width. Where obstacles confine a solid, this would be most of
+what gives way; `contact_stiffness` says how much stiffer contact is made then.
 
 Of the tangent, the part due to the turning of normals is in proportion to the pressure, and negative. An iteration that
 starts deep in an obstacle has pressures far beyond any that can be carried, with which that part would make the tangent
@@ -16,8 +17,9 @@ steps may be larger than elements.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -40,6 +42,11 @@ STIFFNESS = 100.0
 LARGEST_PRESSURE = 0.1
 #: Surfaces that overlap by less than such a part of a face's width touch.
 TOUCHING = 1e-4
+#: Cosine between a surface's normal and the direction to an obstacle that it may come to lie on.
+FACING = 0.7
+#: Contact is made at most as stiff as a layer that cannot bulge. Where that is less than so many times as stiff as one
+#: that can, nothing confines a solid much, and nothing is asked.
+WORTH_ASKING = 3.0
 
 
 @dataclass(frozen=True)
@@ -60,16 +67,25 @@ class _Spring:
 
 @dataclass(frozen=True)
 class _Side:
-    """A surface in contact, and Young's modulus (f,) behind each of its faces, Pa."""
+    """A surface in contact.
+
+    Attributes
+    ----------
+    stiffness : in place of `STIFFNESS`.
+    young, confined : (f,) moduli of the material behind each face, Pa: Young's, and that of what cannot bulge.
+    """
 
     surface: ContactSurface
+    stiffness: float
     young: Array
+    confined: Array
 
-    def spring(self, points: Indices) -> _Spring:
-        """Of some of its points (k,)."""
+    def spring(self, points: Indices, stiffening: float = 1.0) -> _Spring:
+        """Of some of its points (k,), stiffer by a factor where the material is that stiff if confined."""
         faces = self.surface.face[points]
         young = self.young[faces]
-        return _Spring(self.surface.weights[points], STIFFNESS * young / self.surface.widths[faces], young)
+        modulus = np.clip(stiffening * young, young, np.maximum(young, self.confined[faces]))
+        return _Spring(self.surface.weights[points], self.stiffness * modulus / self.surface.widths[faces], young)
 
 
 @dataclass(frozen=True)
@@ -128,6 +144,11 @@ class _Entered:
         middle = sp.bsr_matrix((blocks, number, np.arange(len(blocks) + 1)), shape=(self._size[0],) * 2)
         return sp.csr_matrix(self.forms.T @ (middle @ self.forms))
 
+    def approach(self, changes: Array) -> Array:
+        """(c, k) by how much changes (c, 3 n) of the dofs open the gaps, m, with what is touched held."""
+        places = (self.forms @ changes.T).T.reshape(len(changes), -1, self.curvature.shape[1])
+        return np.einsum("ckx,kx->ck", places[:, :, :3], self.normal)
+
     def residual_slopes(self) -> Array:
         """(d, 3 n) derivatives of the residual by the parameters at fixed dofs and undeformed shape."""
         change = self.slopes[:, :, None] * self.normal + self.gap[:, None] * self.normal_slopes
@@ -145,8 +166,11 @@ class ContactAssembly:
     space : displacements.
     shape : how the undeformed shape depends on parameters.
     contacts : see `contact`.
-    shear : (n_cells,) shear modulus of each cell's material, Pa: a third of Young's modulus, if incompressible.
+    bulk, shear : (n_cells,) moduli of each cell's material, Pa. Three times the shear modulus is Young's modulus, if
+        incompressible.
     symbols : parameters.
+    stiffening : how much stiffer contact has to be, if the solid is confined; asked when first needed.
+    factor : of the penalty's stiffness besides.
     """
 
     def __init__(
@@ -154,11 +178,15 @@ class ContactAssembly:
         space: DisplacementSpace,
         shape: Shape,
         contacts: Sequence[Contact],
+        bulk: Array,
         shear: Array,
         symbols: ParameterSymbols,
+        stiffening: Callable[[], float],
+        factor: float = 1.0,
     ) -> None:
         self._shape, self._symbols, self._contacts, self._n = shape, symbols, contacts, space.n_scalar
-        self._mesh, self._space, self._shear = space.geometry.mesh, space, shear
+        self._mesh, self._space, self._bulk, self._shear = space.geometry.mesh, space, bulk, shear
+        self._ask_stiffening, self._factor = stiffening, factor
         self._sides: dict[str, _Side] = {}
         for contact in contacts:
             self._side(contact.on)
@@ -170,12 +198,36 @@ class ContactAssembly:
     def _side(self, name: str) -> _Side:
         if name not in self._sides:
             faces = self._mesh.surface(name)
-            self._sides[name] = _Side(ContactSurface.of(self._space, faces), 3.0 * self._shear[faces[:, 0]])
+            bulk, shear = self._bulk[faces[:, 0]], self._shear[faces[:, 0]]
+            surface, stiffness = ContactSurface.of(self._space, faces), STIFFNESS * self._factor
+            self._sides[name] = _Side(surface, stiffness, 3.0 * shear, bulk + 4.0 / 3.0 * shear)
         return self._sides[name]
+
+    @cached_property
+    def stiffening(self) -> float:
+        """How much stiffer the penalty of all contacts is than in a solid that nothing confines."""
+        most = max(float(np.max(side.confined / side.young)) for side in self._sides.values())
+        return max(1.0, self._ask_stiffening()) if most > WORTH_ASKING else 1.0
+
+    def closed(self) -> list[_Entered]:
+        """The points of the undeformed surfaces that face an obstacle, for each, as if they had just touched it."""
+        undeformed, parts = self._shape.coordinates(self._symbols), []
+        for contact in self._contacts:
+            if isinstance(contact, SurfaceContact):
+                continue
+            surface = self._side(contact.on).surface
+            places, step = surface.positions(undeformed), 1e-3 * np.eye(3) * surface.widths.min()
+            # By differences, for obstacles need have no derivatives where nothing has entered them.
+            sides = [[contact.touch(self._symbols, places + sign * s).gap for s in step] for sign in (1.0, -1.0)]
+            normals = (np.array(sides[0]) - np.array(sides[1])).T / (2.0 * step[0, 0])
+            outward = surface.normals_at(undeformed, surface.face, surface.place)
+            facing = np.flatnonzero(np.einsum("qx,qx->q", normals, outward) < -FACING)
+            parts.append(self._touched(contact, facing, places[facing], np.zeros(len(facing)), normals[facing]))
+        return parts
 
     def _check_apart(self) -> None:
         self._check_outside()
-        for contact, parts in zip(self._contacts, self._entered(np.zeros(3 * self._n)), strict=True):
+        for contact, parts in zip(self._contacts, self._found(np.zeros(3 * self._n), 1.0), strict=True):
             rigid = not isinstance(contact, SurfaceContact)
             if rigid and any(s.any() for s in contact.slopes(self._symbols)):
                 continue
@@ -233,41 +285,61 @@ class ContactAssembly:
 
     def _entered(self, x: Array) -> list[list[_Entered]]:
         """For each contact, the points that have entered something at ``x`` (3 n,) and the present parameters."""
-        mu = np.array([self._symbols.value(self._symbols[p.name]) for p in self._symbols.parameters])
+        mu = self._symbols.present
         known = self._latest
         if known is None or not (np.array_equal(known[0], x) and np.array_equal(known[1], mu)):
-            undeformed = self._shape.coordinates(self._symbols)
-            deformed = undeformed + x.reshape(3, -1).T
-            found = []
-            for contact in self._contacts:
-                if isinstance(contact, SurfaceContact):
-                    pairs = {(contact.on, contact.against), (contact.against, contact.on)}
-                    found.append([self._entered_surface(*pair, undeformed, deformed) for pair in sorted(pairs)])
-                else:
-                    found.append([self._entered_rigid(contact, deformed)])
-            known = self._latest = x.copy(), mu, found
+            known = self._latest = x.copy(), mu, self._found(x, self.stiffening)
         return known[2]
 
-    def _entered_rigid(self, contact: RigidObstacle, deformed: Array) -> _Entered:
+    def _found(self, x: Array, stiffening: float) -> list[list[_Entered]]:
+        """`_entered`, with a penalty that is stiffer by a factor."""
+        undeformed = self._shape.coordinates(self._symbols)
+        deformed, found = undeformed + x.reshape(3, -1).T, []
+        for contact in self._contacts:
+            if isinstance(contact, SurfaceContact):
+                pairs = sorted({(contact.on, contact.against), (contact.against, contact.on)})
+                found.append([self._entered_surface(pair, undeformed, deformed, stiffening) for pair in pairs])
+            else:
+                found.append([self._entered_rigid(contact, deformed, stiffening)])
+        return found
+
+    def _entered_rigid(self, contact: RigidObstacle, deformed: Array, stiffening: float) -> _Entered:
         side = self._side(contact.on)
         places = side.surface.positions(deformed)
         touch = contact.touch(self._symbols, places)
         inside = np.flatnonzero(touch.gap < 0.0)
+        parts = touch.gap[inside], touch.normal[inside], touch.curvature[inside]
+        return self._touched(contact, inside, places[inside], *parts, stiffening)
+
+    def _touched(
+        self,
+        contact: RigidObstacle,
+        points: Indices,
+        places: Array,
+        gap: Array,
+        normal: Array,
+        curvature: Array | None = None,
+        stiffening: float = 1.0,
+    ) -> _Entered:
+        """Points (k,) of a contact's surface that have entered its obstacle; of no ``curvature`` if None."""
+        side = self._side(contact.on)
         moved, offset = contact.slopes(self._symbols)
-        normal, curvature = touch.normal[inside], touch.curvature[inside]
+        curvature = np.zeros((len(points), 3, 3)) if curvature is None else curvature
         return _Entered(
-            side.spring(inside),
-            touch.gap[inside],
+            side.spring(points, stiffening),
+            gap,
             normal,
-            places[inside],
-            place_forms(side.surface.dofs[side.surface.face[inside]], side.surface.functions[inside], self._n),
+            places,
+            place_forms(side.surface.dofs[side.surface.face[points]], side.surface.functions[points], self._n),
             curvature,
             offset[:, None] - moved @ normal.T,
             -np.einsum("kxy,dy->dkx", curvature, moved),
         )
 
-    def _entered_surface(self, on: str, against: str, undeformed: Array, deformed: Array) -> _Entered:
-        side, other = self._side(on), self._side(against).surface
+    def _entered_surface(
+        self, pair: tuple[str, str], undeformed: Array, deformed: Array, stiffening: float
+    ) -> _Entered:
+        side, other = self._side(pair[0]), self._side(pair[1]).surface
         found = find_crossings(side.surface, other, (undeformed, undeformed), (deformed, deformed))
         places = side.surface.positions(deformed)[found.points]
         own, faces = side.surface.face[found.points], found.face
@@ -277,7 +349,7 @@ class ContactAssembly:
         turning, curvature = _turning(other, deformed, found, places, self._n)
         none = np.zeros((len(self._symbols), len(found.gap)))
         return _Entered(
-            side.spring(found.points),
+            side.spring(found.points, stiffening),
             found.gap,
             found.normal,
             places,

@@ -51,6 +51,11 @@ class ParameterSymbols:
         """Values (d,) of the state that nothing is known about, SI."""
         return np.array([p.default for p in self.parameters])
 
+    @property
+    def present(self) -> Array:
+        """Values (d,) now, SI."""
+        return np.array([symbol.Get() for symbol in self._symbols.values()])
+
     def text(self, mu: Array) -> str:
         """A state (d,), SI, for messages: "load = 0.015 N, modulus = 3 MPa"."""
         return state_text(self.parameters, mu)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.mechanics.contact import Contact
 from morph_dslam.mechanics.contact_assembly import ContactAssembly
+from morph_dslam.mechanics.contact_stiffness import stiffening
 from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.enhanced_strain import EnhancedStrain, takes_enhanced_strain
 from morph_dslam.mechanics.kinematics import Kinematics, Shape, ShapeField
@@ -63,6 +64,7 @@ class SolidOptions:
         material is mixed; see `DisplacementSpace`.
     at_nodes : evaluate stresses and strains at the nodes themselves, as elements of third order do, in place of where
         they are most accurate: what coarser elements are compared with must not share their error of extrapolation.
+    contact : factor of the stiffness of contact: what others are compared with must not give way as they do.
     threads : of PARDISO; None leaves MKL's choice.
     """
 
@@ -70,6 +72,7 @@ class SolidOptions:
     mixed: bool | None = None
     serendipity: bool = False
     at_nodes: bool = False
+    contact: float = 1.0
     threads: int | None = None
 
 
@@ -98,7 +101,6 @@ class SolidProblem:
     n_unknowns : how many dofs are the solid's own; motions of couplings follow (`coupled_solid`).
     free : see `newton.Equations`.
     scale : see `newton.Equations`.
-    in_contact : see `newton.in_contact`.
     applied_first : makes the same solid with what is to act before everything else (`continuation.loaded_state`);
         None if all grows together.
     flags : what a result obtained with this discretisation must be doubted for; empty if nothing.
@@ -140,7 +142,6 @@ class SolidProblem:
         n_displacements = 3 * self.displacements.n_scalar
         self.assembly = self._make_assembly()
         self.contact = self._make_contact(contacts)
-        self.in_contact = bool(contacts)
         self.applied_first: Callable[[], SolidProblem] | None = None
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
@@ -222,9 +223,10 @@ class SolidProblem:
     def _make_contact(self, contacts: Sequence[Contact]) -> ContactAssembly | None:
         if not contacts:
             return None
-        moduli = [isotropic_average(region.material.small_strain_stiffness())[1] for region in self.regions]
-        shear = np.array(moduli)[np.searchsorted(np.unique(self.cell_materials), self.cell_materials)]
-        return ContactAssembly(self.displacements, self.shape, contacts, shear, self.symbols)
+        moduli = [isotropic_average(region.material.small_strain_stiffness()) for region in self.regions]
+        bulk, shear = np.array(moduli)[np.searchsorted(np.unique(self.cell_materials), self.cell_materials)].T
+        asked, factor = partial(stiffening, self), self.options.contact
+        return ContactAssembly(self.displacements, self.shape, contacts, bulk, shear, self.symbols, asked, factor)
 
     def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
         if isinstance(load, PointLoad):
@@ -249,6 +251,11 @@ class SolidProblem:
         free[: self.space.ndof] = np.array(self.space.FreeDofs(), dtype=bool)
         free[: 3 * self.displacements.n_scalar] &= ~self.constraints.held
         return free
+
+    @cached_property
+    def in_contact(self) -> float:
+        """See `newton.in_contact`."""
+        return self.contact.stiffening if self.contact else 0.0
 
     @cached_property
     def solver(self) -> TangentSolver:
@@ -279,10 +286,18 @@ class SolidProblem:
     def residual(self, x: Array, mu: Array) -> Array:
         return self._evaluate(x, mu).copy()
 
+    def own_residual(self, x: Array) -> Array:
+        """(n_unknowns,) at ``x`` (n_unknowns,) and the present parameters, without contact."""
+        return self.assembly.residual(x) - self._padded(self._nodal_forces.values())
+
+    def own_residual_slopes(self, x: Array) -> Array:
+        """(d, n_unknowns) derivatives of `own_residual` by the parameters."""
+        return self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
+
     def _evaluate(self, x: Array, mu: Array) -> Array:
         """The residual, kept for the tangent at the same point."""
         self._set(mu)
-        residual = self.assembly.residual(x) - self._padded(self._nodal_forces.values())
+        residual = self.own_residual(x)
         if self.contact:
             residual += self._padded(self.contact.residual(x[: 3 * self.displacements.n_scalar]))
         self._latest = x.copy(), np.array(mu), residual
@@ -308,7 +323,7 @@ class SolidProblem:
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         self._set(mu)
-        slopes = self.assembly.residual_slopes(x) - self._padded(self._nodal_forces.slopes())
+        slopes = self.own_residual_slopes(x)
         if self.contact:
             slopes += self._padded(self.contact.residual_slopes(x[: 3 * self.displacements.n_scalar]))
         return slopes

@@ -61,6 +61,8 @@ BYTES_OF_A_MILLION = 45e9
 #: The same of an iterative solve: time in units of a tangent of the study's elements and of the ratio of unknowns
 #: (measured on a seal of 287 thousand), memory of an unknown (6 kB on that seal, 12 kB on hexahedra of third order).
 ITERATIVE_TANGENTS, ITERATIVE_BYTES = 6.0, 12e3
+#: Contact's stiffness in the finer solutions over the study's.
+STIFFER = 10.0
 #: Highest order of a shell's displacements.
 FINEST_SHELL = 3
 #: Fields that follow from derivatives of the displacement, and part of the nodes that must have them for an estimate.
@@ -218,7 +220,8 @@ def _finer(study: SolidStudy | ShellStudy, coarse: SolidProblem) -> SolidProblem
     order = coarse.displacements.order + 1
     if isinstance(study, ShellStudy):
         return study.problem(ShellOptions(order=order, threads=coarse.options.threads))
-    options = SolidOptions(order=order, serendipity=True, at_nodes=True, threads=coarse.options.threads)
+    threads = coarse.options.threads
+    options = SolidOptions(order=order, serendipity=True, at_nodes=True, contact=STIFFER, threads=threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # the study's elements were warned about
         return study.problem(options)

@@ -254,7 +254,8 @@ class SolidStudy(BodyStudy, Section):
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
         for section in content.get("contacts", ()):
             if section["kind"] != "surface":
-                content["passages"] = "refused"  # earlier versions kept solutions with an obstacle behind a wall
+                # Earlier versions kept solutions with an obstacle behind a wall, or that gave way where confined.
+                content["passages"], content["penalty"] = "refused", "stiff where confined"
             if section["kind"] == "mesh":
                 section["file"] = hashlib.sha256(Path(section["file"]).read_bytes()).hexdigest()
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

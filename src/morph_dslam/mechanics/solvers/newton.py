@@ -28,7 +28,8 @@ MAX_ITERATIONS = 20
 DIVERGED = 10.0
 #: A step damped further has stalled.
 SMALLEST_DAMPING = 1.0 / 64.0
-#: Where points begin or cease to touch on the way, the simplified correction may be so much larger than the update.
+#: Where points begin or cease to touch on the way, the simplified correction may be so much larger than the update, and
+#: more if contact is stiffer.
 GROWTH_IN_CONTACT = 100.0
 #: A tangent is kept where so many more corrections with it should do, judged by the last two ...
 MOST_CHORDS = 4
@@ -109,9 +110,12 @@ class State:
     iterations: int = 0
 
 
-def in_contact(equations: Equations) -> bool:
-    """Whether equations have contact, which they say by a true attribute of this name: their tangent may jump."""
-    return bool(getattr(equations, "in_contact", False))
+def in_contact(equations: Equations) -> float:
+    """How stiff contact is: 1 as usual, more in confined solids; 0 without, as where there is no such attribute.
+
+    With contact, the tangent may jump.
+    """
+    return float(getattr(equations, "in_contact", 0.0))
 
 
 def where(equations: Equations, mu: Array) -> str:
@@ -179,7 +183,7 @@ def _damped_step(
 ) -> _Trial:
     """The point along ``update`` that is accepted."""
     length, damping = size(equations, update), 1.0
-    allowed = length * (GROWTH_IN_CONTACT if in_contact(equations) else 1.0)
+    allowed = length * max(1.0, GROWTH_IN_CONTACT * in_contact(equations))
     while damping >= SMALLEST_DAMPING:
         point = x + damping * update
         residual = equations.residual(point, mu)
