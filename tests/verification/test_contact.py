@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from morph_dslam.mechanics.contact import RigidCylinder, RigidObstacle, RigidPlane, RigidSphere
+from morph_dslam.mechanics.coupled_solid import CoupledSolid
+from morph_dslam.mechanics.couplings import Coupling
 from morph_dslam.mechanics.loads import DeadTraction
 from morph_dslam.mechanics.materials.isotropic import LinearElastic, StVenantKirchhoff
 from morph_dslam.mechanics.parameters import ParameterSymbols
@@ -153,3 +155,17 @@ def test_confined_block(cell_type: str, pushed: str) -> None:
     differences = (other.dofs - state.dofs) / (0.02 * push)
     slopes = sensitivities(problem, state)[0]
     np.testing.assert_allclose(slopes, differences, atol=1e-3 * np.abs(slopes).max())
+
+
+def test_confined_block_under_a_plate() -> None:
+    """The same under a rigid plate that a force presses down, between four planes."""
+    symbols = load_parameter(push=0.0)
+    mesh = block((0.2, 1.0, 0.2), (3, 4, 3), "hex8")
+    confined = YOUNG * (1.0 - 0.4998) / ((1.0 + 0.4998) * (1.0 - 2.0 * 0.4998))
+    force = -0.2 * 0.99 * confined * (0.99**2 - 1.0) / 2.0
+    walls = [RigidPlane(f"{axis}_min", (0.0, 0.0, 0.0), unit) for axis, unit in (("x", (1, 0, 0)), ("y", (0, 1, 0)))]
+    walls += [RigidPlane("x_max", (0.2, 0.0, 0.0), (-1, 0, 0)), RigidPlane("y_max", (0.0, 1.0, 0.0), (0, -1, 0))]
+    plate = Coupling("z_max", force=(0.0, 0.0, -symbols["push"]), held=("x", "y", "rx", "ry", "rz"))
+    problem = CoupledSolid([plate], mesh, {"all": CONFINED}, [fixed("z_min")], [], symbols, contacts=walls)
+    state = solved(problem, force)
+    assert -problem.motions(state.dofs)[0, 2] == pytest.approx(2e-3, rel=0.02)

@@ -38,7 +38,8 @@ def stiffening(problem: SolidProblem) -> float:
 def closed_shares(problem: SolidProblem) -> Array:
     """Shares (k,) of the penalty, as stiff as in solids that are free, in the energy of the undeformed closed solid.
 
-    Responses are those to the loads at the parameters' defaults and to a change of each parameter, if there are any.
+    Responses are those to the loads at the parameters' defaults, to a change of each parameter, and to each motion of a
+    coupling, if there are any.
     """
     contact, mu, n = problem.contact, problem.symbols.default, 3 * problem.displacements.n_scalar
     assert contact is not None
@@ -46,10 +47,12 @@ def closed_shares(problem: SolidProblem) -> Array:
     closed, x = contact.closed(), np.zeros(problem.n_unknowns)
     if not closed:
         return np.zeros(0)
-    forces = np.vstack([problem.own_residual(x), problem.own_residual_slopes(x)])
+    besides = problem.motions_besides()
+    forces = np.vstack([problem.own_residual(x), problem.own_residual_slopes(x), np.zeros_like(besides)])
     moved = np.vstack([problem.prescribed(mu), problem.prescribed_slopes(mu)])[:, : problem.n_unknowns]
+    moved, of_parameters = np.vstack([moved, besides]), slice(1, 1 + len(mu))
     for part in closed:
-        forces[1:, :n] += part.residual_slopes()
+        forces[of_parameters, :n] += part.residual_slopes()
     tangent = sum((part.tangent(limited=True) for part in closed[1:]), closed[0].tangent(limited=True))
     solver = problem.solver_of(problem.free)
     linearisation = problem.assembly.linearise(x, mu, forces[0], solver, tangent)
@@ -60,9 +63,10 @@ def closed_shares(problem: SolidProblem) -> Array:
     whole = np.einsum("kn,kn->k", changes, linearisation.apply(changes))
     penalty = np.zeros(len(changes))
     for part in closed:
-        of_solid, slopes = part.approach(changes[:, :n]), np.vstack([np.zeros(len(part.gap)), part.slopes])
-        stiffness = part.spring.weights * part.spring.stiffness
-        penalty += (of_solid + slopes) ** 2 @ stiffness
-        whole += ((of_solid + slopes) ** 2 - of_solid**2) @ stiffness
+        of_solid, stiffness = part.approach(changes[:, :n]), part.spring.weights * part.spring.stiffness
+        approach = of_solid.copy()
+        approach[of_parameters] += part.slopes
+        penalty += approach**2 @ stiffness
+        whole += (approach**2 - of_solid**2) @ stiffness
     moving = whole > 0.0
     return penalty[moving] / whole[moving]

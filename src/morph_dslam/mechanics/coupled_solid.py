@@ -104,6 +104,12 @@ class CoupledSolid(SolidProblem):
             of_motions = np.zeros((*of_solid.shape[:-1], self.n_dofs - self.n_unknowns))
         return np.concatenate([of_solid, of_motions], axis=-1)
 
+    def motions_besides(self) -> Array:
+        columns = self._columns(np.zeros(self.n_dofs))[self.free[self.n_unknowns :]]
+        result = np.zeros((len(columns), self.n_unknowns))
+        result[:, self._following] = columns
+        return result
+
     def prescribed(self, mu: Array) -> Array:
         return self._with_motions(super().prescribed(mu))
 

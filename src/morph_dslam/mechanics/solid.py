@@ -286,6 +286,10 @@ class SolidProblem:
     def residual(self, x: Array, mu: Array) -> Array:
         return self._evaluate(x, mu).copy()
 
+    def motions_besides(self) -> Array:
+        """(k, n_unknowns) displacements of the undeformed solid by what moves it beside its supports and loads."""
+        return np.zeros((0, self.n_unknowns))
+
     def own_residual(self, x: Array) -> Array:
         """(n_unknowns,) at ``x`` (n_unknowns,) and the present parameters, without contact."""
         return self.assembly.residual(x) - self._padded(self._nodal_forces.values())
