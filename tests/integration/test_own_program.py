@@ -3,11 +3,18 @@
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import samples
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state, write_landmarks, write_recording
 
 STEP = 0.02
+
+
+def hand(column):
+    """Mask (h, w) of a disc of 60 px in the picture."""
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    return np.hypot(columns - column, rows - 240) < 60.0
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +27,7 @@ def page(tmp_path_factory):
         taken.append(sheet_state(STEP * len(taken)))
         return film.frame(taken[-1])[:, :, :: -1 if rgb else 1].copy()
 
-    names = {"grab": grab, "first_picture": film.frame(sheet_state(0.0))}
+    names = {"grab": grab, "segment": lambda _: hand(300), "first_picture": film.frame(sheet_state(0.0))}
     write_recording(folder, {}, model)
     write_landmarks(folder / "landmarks.csv", model, sheet_state(0.0))
     with pytest.MonkeyPatch.context() as patch:
@@ -52,3 +59,54 @@ def test_the_other_samples_do_what_the_page_says(page):
     assert all(result.tracked for each in names["found"] for result in each.results.values())
     assert sorted(path.name for path in (folder / "states").glob("*.vtu"))[-1].endswith("_0004.vtu")
     np.testing.assert_allclose(names["state"].parameters, [0.020, 0.3, 0.0])
+
+
+AS_DEPTH = {
+    "infinite": lambda mask: np.where(mask, np.float32(0.1), np.float32(np.inf)),
+    "nan": lambda mask: np.where(mask, 0.1, np.nan),
+    "zero": lambda mask: np.where(mask, 0.1, 0.0),
+}
+
+
+def tracked_behind(names, occluders):
+    """Results and true parameters of pictures through which a disc of noise moves."""
+    film, noise = SheetFilm(names["model"]), np.random.default_rng(1)
+    tracker = md.Tracker(names["model"], names["camera"], names["start"], reference=names["first_picture"])
+    results, truths = [], []
+    for step in range(6):
+        truth, mask = sheet_state(STEP * step), hand(150 + 60 * step)
+        picture = film.frame(truth).copy()
+        picture[mask] = noise.integers(0, 255, (int(mask.sum()), 3))
+        results.append(tracker.track(picture, occluder_depth=occluders(mask)))
+        truths.append(truth.parameters)
+    return results, np.array(truths)
+
+
+def test_a_mask_of_what_hides_the_object_keeps_it_out(page):
+    _, names, _ = page
+    results, truths = tracked_behind(names, lambda mask: mask)
+    assert all(result.tracked for result in results)
+    found = np.array([list(result.parameters.values()) for result in results])
+    deviations = np.array([list(result.parameter_std.values()) for result in results])
+    assert (np.abs(found - truths) < 5.0 * deviations + 1e-5).all()
+
+
+def test_depth_of_what_hides_it_may_say_nothing_in_several_ways(page):
+    _, names, _ = page
+    found = [
+        [list(result.parameters.values()) for result in tracked_behind(names, occluders)[0]]
+        for occluders in AS_DEPTH.values()
+    ]
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
+
+
+@pytest.mark.parametrize(
+    "occluders",
+    [lambda mask: mask.tolist(), lambda mask: mask[::2, ::2], lambda mask: 255 * mask.astype(np.uint8)],
+    ids=["list", "half the size", "uint8"],
+)
+def test_what_is_no_mask_and_no_depth_is_refused(page, occluders):
+    _, names, _ = page
+    with pytest.raises(md.MorphError, match=r"occluder_depth \(a mask is an array of bool\) is"):
+        tracked_behind(names, occluders)

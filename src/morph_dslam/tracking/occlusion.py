@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,20 +22,12 @@ from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.outcomes import PoseSource
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
-
-#: How much wider than drawn an object occludes, pixels: what is compared of a point reaches as far.
-MARGIN_PX = 5
+from morph_dslam.tracking.tracker_inputs import widened
 
 
 def drawn_depth(surface: ReducedModel, camera: Camera, state: State) -> NDArray[np.float32]:
     """Depth (h, w) of an object in a camera, metres, infinite where it is not."""
     return draw_view(view_of(surface, camera, state), surface.triangles, camera).depth
-
-
-def widened(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What an object occludes: its depth (h, w), infinite where it is not, and that of a margin around it."""
-    square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
-    return np.asarray(cv2.erode(depth, square), dtype=np.float32)
 
 
 class MultiObjectTracker:

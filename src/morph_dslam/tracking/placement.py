@@ -23,12 +23,13 @@ from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
-from morph_dslam.tracking.occlusion import drawn_depth, widened
+from morph_dslam.tracking.occlusion import drawn_depth
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.setup import TrackedObject
 from morph_dslam.tracking.tracker import Tracker
+from morph_dslam.tracking.tracker_inputs import widened
 from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views, image_of, registered_images
 
 #: Correlation of two contrast-normalized images that are the same but for the compression.

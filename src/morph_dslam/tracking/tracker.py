@@ -50,7 +50,14 @@ from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.row_motion import StateHistory
 from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import error_factors_of
-from morph_dslam.tracking.tracker_inputs import Picture, check_camera, check_look, check_pose, check_tracker
+from morph_dslam.tracking.tracker_inputs import (
+    Picture,
+    check_camera,
+    check_look,
+    check_pose,
+    check_tracker,
+    occluders_of,
+)
 from morph_dslam.tracking.views import (
     ActiveView,
     Change,
@@ -171,7 +178,7 @@ class Tracker:
         self,
         frame: Frame | NDArray[np.uint8],
         localization: CameraLocalization | None = None,
-        occluder_depth: NDArray[np.float32] | None = None,
+        occluder_depth: NDArray | None = None,
     ) -> FrameResult:
         """Find the object in the next frame.
 
@@ -179,13 +186,14 @@ class Tracker:
         ----------
         frame : as recorded, with depth where a depth camera saw it too; or its image alone, (h, w, 3) or (h, w) uint8.
         localization : what `locate` found in the frame; None to find it here.
-        occluder_depth : (h, w) of other objects, metres, infinite where there are none: points that they
-            occlude do not count.
+        occluder_depth : (h, w), what hides the object, whose points do not count there: a mask of bool, True where
+            something is before it in the frame as recorded; or depth of other objects in the undistorted image, metres,
+            infinite, NaN or 0 where there are none.
 
         Raises
         ------
         CameraError
-            If image or depth is not of the camera's size, or of another type.
+            If image, depth or mask is not of the camera's size, or of another type.
         """
         camera = localization or self.locate(frame)
         self.estimator.known.begin(frame.index if isinstance(frame, Frame) else None)
@@ -252,15 +260,14 @@ class Tracker:
 
     # -- the steps of a frame -----------------------------------------------------------------------------
 
-    def _prepare(
-        self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray[np.float32] | None, ready: Image | None
-    ) -> Image:
+    def _prepare(self, frame: Frame | NDArray[np.uint8], occluder_depth: NDArray | None, ready: Image | None) -> Image:
         """Undistort and normalize contrast; the first frame is the reference if none was given, a gap is a loss."""
         with stage("prepare"):
             picture = Picture.of(frame, self.camera, self.options.use_depth)
             motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
             image = ready or picture.made_ready(self._undistortion)
-            image = replace(image, depth=picture.depth, occluder_depth=occluder_depth, motion=motion)
+            occluders = occluders_of(occluder_depth, self.camera, self._undistortion)
+            image = replace(image, depth=picture.depth, occluder_depth=occluders, motion=motion)
             if self._views is None:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
+from morph_dslam.camera import Camera, Maps
 from morph_dslam.errors import ArgumentError, RegistrationError, TrackingError, check_kind
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
@@ -21,6 +21,8 @@ from morph_dslam.tracking.patches import normalize_contrast
 
 #: Nodes that are farther apart than this share of the object's size belong to different meshes.
 OTHER_MESH = 1e-3
+#: How much wider than it is seen something occludes, pixels: what is compared of a point reaches as far.
+MARGIN_PX = 5
 
 
 def check_tracker(model: object, registration: object, options: object) -> None:
@@ -98,6 +100,43 @@ def check_look(registration: Registration, is_given: bool) -> None:
             "like: read it as load_registration(path, model, scene) with scene = md.load_scene('map.h5', camera), or "
             f"give the picture{of_frame} as reference="
         )
+
+
+def widened(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What something occludes: its depth (h, w), infinite where it is not, and that of a margin around it."""
+    square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(depth, square), dtype=np.float32)
+
+
+def occluders_of(given: object, camera: Camera, undistortion: Maps | None) -> NDArray[np.float32] | None:
+    """What hides the object, as trackers take it: depth (h, w) in the undistorted image, infinite where nothing does.
+
+    Parameters
+    ----------
+    given : a mask (h, w) of bool in the picture as recorded, True where something hides the object; or the depth (h, w)
+        of what may, metres, in the undistorted image: infinite, NaN or 0 where there is nothing; None for neither.
+    camera : of the picture.
+    undistortion : its maps; None if it has no distortion.
+
+    Raises
+    ------
+    CameraError
+        If it is neither, or of another size.
+    """
+    if given is None:
+        return None
+    where = "occluder_depth (a mask is an array of bool)"
+    if isinstance(given, np.ndarray) and given.dtype == np.bool_:
+        hidden = given.astype(np.uint8)
+        camera.check_image(hidden, where)
+        if undistortion is not None:
+            hidden = cv2.remap(hidden, *undistortion, interpolation=cv2.INTER_NEAREST)
+        # Whatever the object's own depth is, it is in front.
+        return widened(np.where(hidden > 0, np.float32(0.0), np.float32(np.inf)))
+    camera.check_depth(given, where)  # type: ignore[arg-type]
+    depth = np.asarray(given, dtype=np.float32)
+    known = depth > 0.0
+    return depth if known.all() else np.where(known, depth, np.float32(np.inf))
 
 
 @dataclass(frozen=True)
