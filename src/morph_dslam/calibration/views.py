@@ -16,7 +16,7 @@ from morph_dslam.calibration.board import CalibrationBoard
 from morph_dslam.errors import CameraError
 from morph_dslam.io.file_kinds import IMAGES, file_kind
 from morph_dslam.sources import open_source
-from morph_dslam.sources.frames import image_files, read_image
+from morph_dslam.sources.frames import image_files, read_image, turned_deg
 
 Array = NDArray[np.float64]
 #: So many frames of a video are searched for the board, evenly spread over it.
@@ -138,7 +138,16 @@ def _image_files(sources: Sequence[Path]) -> list[Path]:
 
 
 def _read(files: Iterable[Path]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """Images by name; CameraError if some are turned to be shown and others not: a camera has one principal point."""
+    turns: dict[int, str] = {}
     for path in files:
+        turns.setdefault(turned_deg(path, "calibration image"), path.name)
+        if len(turns) > 1:
+            (one, first), (other, second) = turns.items()
+            raise CameraError(
+                f"{first} is marked to be shown turned by {one} degrees and {second} by {other} (EXIF): give pictures "
+                "for which the camera was held alike"
+            )
         yield path.name, read_image(path, "calibration image")
 
 

@@ -125,7 +125,7 @@ class PictureInitializer:
 def load_picture(path: Path) -> PictureInitializer:
     """Read a picture file and its image; raises RegistrationError or SourceError if one is wrong."""
     described = read_sections(path, "picture file", PictureFile, RegistrationError)
-    image = read_image(path.parent / described.image, "picture of the print", as_shown=True)
+    image = read_image(path.parent / described.image, "picture of the print")
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     if described.rectangle is not None:
         r = described.rectangle

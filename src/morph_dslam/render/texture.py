@@ -77,7 +77,7 @@ def load_photograph(name: str, folder: Path) -> NDArray[np.uint8]:
     """A photograph (H, W, 3) uint8, blue, green, red; raises SceneError as `find_photograph` does."""
     path = find_photograph(name, folder)
     try:
-        return read_image(path, f"photograph '{name}'", as_shown=True)
+        return read_image(path, f"photograph '{name}'")
     except SourceError as error:
         raise SceneError(str(error)) from error
 

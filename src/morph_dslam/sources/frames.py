@@ -18,8 +18,6 @@ from morph_dslam.io.file_kinds import IMAGES, content_kind, file_kind, named_kin
 
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
-#: How images of a camera are decoded: as they are stored, whatever their head says of how the camera was held.
-AS_RECORDED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 #: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
 _END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9"}
 
@@ -126,22 +124,24 @@ def has_registered_depth(source: FrameStream) -> bool:
 
 def notes_of_source(source: object, readout_s: float = 0.0) -> tuple[str, ...]:
     """What a reader of the results must know of the frames, in words; with the readout time of their camera."""
-    notes = tuple(getattr(source, "notes", ()))
-    if not readout_s or not getattr(source, "has_assumed_times", False):
-        return notes
-    return (
-        *notes,
-        f"nothing tells the times of the frames: {ASSUMED_FPS:g} a second are assumed, and readout_s of the camera "
-        "file counts by them, as does what is said of the camera; give the right number with --fps",
-    )
-
-
-def orientation_note(name: str) -> str:
-    """What to know of a recording that other programs show turned."""
-    return (
-        f"{name} is marked to be shown turned, which is not done here: pixels are taken as the sensor recorded them, "
-        "and those of landmarks and of the camera file must be too (docs/sources.md)"
-    )
+    notes, degrees = [], getattr(source, "turned_deg", 0)
+    name = getattr(source, "name", "the recording")
+    if degrees == 180:
+        notes.append(
+            f"{name} is marked as upside down and is read the right way up: the camera file has to be of pictures that "
+            "are read so too, or its principal point is mirrored (docs/cameras.md)"
+        )
+    if degrees and readout_s:
+        notes.append(
+            f"{name} is marked to be shown turned, and is read so: its rows are not those of the camera, which "
+            "readout_s counts; leave that out, or record without the mark (docs/cameras.md)"
+        )
+    if readout_s and getattr(source, "has_assumed_times", False):
+        notes.append(
+            f"nothing tells the times of the frames: {ASSUMED_FPS:g} a second are assumed, and readout_s of the camera "
+            "file counts by them, as does what is said of the camera; give the right number with --fps"
+        )
+    return tuple(notes)
 
 
 def check_range(where: Path, available: range, first: int | None, last: int | None) -> tuple[int, int]:
@@ -186,20 +186,21 @@ def image_files(folder: Path) -> list[Path]:
     return [path for path in files if named_kind(path) in IMAGES] or [f for f in files if file_kind(f) in IMAGES]
 
 
-def read_image(path: Path, what: str, as_shown: bool = False) -> NDArray[np.uint8]:
-    """Read an image (h, w, 3) uint8 as blue, green, red.
-
-    Its pixels are as the sensor recorded them, which lens and rows of the camera belong to, whatever the file says of
-    how the camera was held; ``as_shown`` turns it so, for images that are not of the camera.
+def read_image(path: Path, what: str) -> NDArray[np.uint8]:
+    """Read an image (h, w, 3) uint8 as blue, green, red, turned as its EXIF data say.
 
     Raises SourceError if the file is missing, cut short or not an image; the message begins with ``what``.
     """
-    return np.asarray(_decode(path, what, cv2.IMREAD_COLOR if as_shown else AS_RECORDED), dtype=np.uint8)
+    return np.asarray(_decode(path, what, cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
-def is_shown_turned(path: Path, what: str) -> bool:
-    """Whether other programs show an image otherwise than the sensor recorded it."""
-    return not np.array_equal(read_image(path, what), read_image(path, what, as_shown=True))
+def turned_deg(path: Path, what: str) -> int:
+    """By how many degrees an image is turned to be shown: 0, 90 to either side, or 180."""
+    stored = _decode(path, what, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    shown = read_image(path, what)
+    if shown.shape != stored.shape:
+        return 90
+    return 0 if np.array_equal(shown, stored) else 180
 
 
 def read_depth(path: Path, what: str, scale: DepthScale) -> NDArray[np.float32]:
@@ -233,7 +234,6 @@ NETWORK_TIMEOUT_MS = 10_000
 def open_capture(source: str | int, is_remote: bool = False) -> cv2.VideoCapture:
     """A video file, a webcam by its number, or what a URL leads to; see its ``isOpened()``.
 
-    Frames are not turned, so that lens and rows of the camera belong to them whatever the file says of how it was held.
     What OpenCV and FFmpeg print is kept away. What ``is_remote`` is given up if it is silent for `NETWORK_TIMEOUT_MS`.
     """
     # FFmpeg's log level AV_LOG_QUIET; it is read once, when the first video is opened.
@@ -243,16 +243,11 @@ def open_capture(source: str | int, is_remote: bool = False) -> cv2.VideoCapture
     before = log.getLogLevel()
     log.setLogLevel(0)
     try:
-        if isinstance(source, int):
+        if not is_remote:
             return cv2.VideoCapture(source)
-        if is_remote:
-            limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
-            parameters = [number for limit in limits for number in (limit, NETWORK_TIMEOUT_MS)]
-            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, parameters)
-        else:
-            capture = cv2.VideoCapture(source)
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        return capture
+        limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+        parameters = [number for limit in limits for number in (limit, NETWORK_TIMEOUT_MS)]
+        return cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, parameters)
     finally:
         log.setLogLevel(before)
 

@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
 from morph_dslam.sources import frames as limits
-from morph_dslam.sources.frames import (
-    Frame,
-    FrameStream,
-    frame_rate,
-    has_registered_depth,
-    notes_of_source,
-    open_capture,
-)
+from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, has_registered_depth, open_capture
 from morph_dslam.sources.steady_times import SteadyTimes
 
 _LOG = logging.getLogger("morph_dslam")
@@ -282,7 +275,7 @@ class PacedRecording(LiveStream):
         self._source, self._clock, self._sleep = source, clock, sleep
         self.has_registered_depth = has_registered_depth(source)
         self.has_assumed_times = getattr(source, "has_assumed_times", False)
-        self.notes = notes_of_source(source)
+        self.turned_deg = getattr(source, "turned_deg", 0)
 
     def read(self) -> Iterator[Frame]:
         first: tuple[float, float] | None = None

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.frames import AS_RECORDED, ASSUMED_FPS, Frame
+from morph_dslam.sources.frames import ASSUMED_FPS, Frame
 from morph_dslam.sources.live import LiveStream
 
 #: Of a frame: its number, its time in seconds, bytes of its JPEG.
@@ -27,6 +27,8 @@ FRAME_HEAD = struct.Struct("<IdI")
 PICTURE_HEAD = struct.Struct("<II")
 #: Bytes of a JPEG; more is no frame.
 MOST_BYTES = 8_000_000
+#: How it is decoded: as it is stored, whatever its head says of how the camera was held.
+_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 class SocketCamera(LiveStream):
@@ -53,7 +55,7 @@ class SocketCamera(LiveStream):
                 raise SourceError(f"{self.name} sent {size} bytes as frame {index}: a frame has {MOST_BYTES} at most")
             data = self._exactly(size)
             captured = time.monotonic()
-            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), AS_RECORDED) if data else None
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _FLAGS) if data else None
             if image is not None:
                 yield Frame(index, seconds, np.asarray(image, dtype=np.uint8), captured=captured)
 

@@ -20,10 +20,9 @@ from morph_dslam.sources.frames import (
     check_range,
     check_size,
     image_files,
-    is_shown_turned,
-    orientation_note,
     read_depth,
     read_image,
+    turned_deg,
 )
 
 TUM_DEPTH = DepthScale(values_per_metre=5000.0)
@@ -103,10 +102,10 @@ class RecordedFrames:
         return scale is not None and scale.registered and any(r.depth is not None for r in self._records)
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What a reader of the results must know of the frames."""
+    def turned_deg(self) -> int:
+        """By how many degrees the first image is turned to be shown: 0, 90 to either side, or 180."""
         first = self._records[0]
-        return (orientation_note(self.name),) if is_shown_turned(first.image, f"frame {first.index}") else ()
+        return turned_deg(first.image, f"frame {first.index}")
 
     def with_depth_per_metre(self, values: float) -> RecordedFrames:
         """The same frames, whose depth images have so many values a metre.

@@ -10,7 +10,7 @@ import numpy as np
 
 from morph_dslam.errors import SourceError
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capture, orientation_note
+from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capture
 
 #: Containers that only estimate their length from its duration are off by so many frames without damage.
 LENGTH_TOLERANCE = 1
@@ -71,12 +71,14 @@ class VideoFile:
         capture = _open(path)
         try:
             self._declared, self.fps = _count_and_rate(path, capture)
-            is_turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) != 0
+            #: By how many degrees frames are turned to be shown: 0, 90 to either side, or 180.
+            self.turned_deg = {180: 180, 90: 90, 270: 90}.get(
+                round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360, 0
+            )
         finally:
             capture.release()
         self._path, self._open_ended, self.name = path, last is None, str(path)
         self._first, self._last = check_range(path, range(self._declared), first, last)
-        self.notes = (orientation_note(self.name),) if is_turned else ()
 
     def __len__(self) -> int:
         return self._last - self._first + 1

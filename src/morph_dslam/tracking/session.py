@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from morph_dslam.errors import ArgumentError, SourceError, check_kind
 from morph_dslam.sources import Frame
-from morph_dslam.sources.frames import FrameSource, check_frame, notes_of_source
+from morph_dslam.sources.frames import FrameSource, check_frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
@@ -185,9 +185,9 @@ class SynchronizedFrames:
         return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, **told)]
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What a reader of the results must know of the recordings."""
-        return tuple(note for source in self.sources for note in notes_of_source(source))
+    def turned_deg(self) -> int:
+        """By how many degrees the first camera's frames are turned to be shown."""
+        return getattr(self.sources[0], "turned_deg", 0)
 
     @property
     def has_assumed_times(self) -> bool:
