@@ -353,6 +353,26 @@ def test_second_identical_object_is_not_taken_for_the_first(model, film):
     assert mean_error(model, result.estimate.state, changed[1]) < 1.5e-3
 
 
+@pytest.mark.parametrize("moved_mm", [12.0, 37.0, 70.0])
+def test_a_regular_print_is_not_found_a_period_off(model, moved_mm):
+    """Dots are 35 mm apart. While it is hidden the sheet moves by about as much, or by two of that."""
+    film = SheetFilm(model)
+    rows, columns = np.indices((594, 840)) % 70 - 35
+    film.texture = 60.0 + 140.0 * (np.hypot(rows, columns) < 18)
+    tracker = start(model, film)
+    for step in range(3):
+        assert tracker.track(film.frame(sheet_state(0.01 * step))).status == "tracked"
+    assert tracker.track(film.blank()).status == "lost"
+    errors = []
+    for step in range(4):
+        truth = aside(sheet_state(0.03 + 0.01 * step), [1e-3 * moved_mm, 0.0, 0.0])
+        result = tracker.track(film.frame(truth))
+        if result.estimate is not None:
+            errors.append(mean_error(model, result.estimate.state, truth))
+    assert errors
+    assert max(errors) < 1e-3
+
+
 def with_disc(image, step):
     """The image (h, w, 3) with a striped disc that goes round over its middle."""
     turn, along = 2.0 * np.pi * step / 15, np.indices(image.shape[:2]).sum(axis=0)

@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.landmarks import shape_starts, solve_pnp
 from morph_dslam.timing import stage
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, agree, reject
+from morph_dslam.tracking.lookalikes import lookalike_shifts
 from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
+from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.reference import ReferenceView
@@ -31,6 +34,11 @@ LOOSE_PX, LOOSE_TO_USUAL = 1.0, 10.0
 UNHIDDEN = 0.75
 #: At most about so many shapes are tried, lest a mirrored one that fits nearly as well is taken.
 MOST_SHAPES = 27
+#: Where other places look alike, it is not believed if its points spread more than so many times the usual; where fewer
+#: than `UNHIDDEN` of all agree, `CLOSE_TO_USUAL`.
+ALIKE_TO_USUAL = 5.0
+#: So many standard deviations tell two places apart.
+SIGNIFICANT = 3.0
 #: Share of the latest frame in the usual spread.
 LEARNING_RATE = 0.05
 
@@ -80,19 +88,31 @@ class Recovery:
             return 0.0
         return float(np.sqrt(spread**2 - self._usual_px**2))
 
-    def reject(self, attempt: PoseHypothesis, followed: bool) -> Rejection | None:
-        """Why an object is not accepted; None when it is. One that was not ``followed`` must agree more closely."""
+    def reject(self, attempt: PoseHypothesis, followed: bool, alike: bool = False) -> Rejection | None:
+        """Why an object is not accepted; None when it is.
+
+        One that was not ``followed`` must agree more closely, and about as closely as usual where others are ``alike``.
+        """
         rejection = reject(attempt, self._options)
         if rejection is not None or attempt.outline_alone or self._known_by_map(attempt):
             return rejection
-        if agree(attempt, self._options.least_share if followed else MOST_AGREE):
-            return None
-        least, to_usual = (LOOSE_PX, LOOSE_TO_USUAL) if followed else (CLOSE_PX, CLOSE_TO_USUAL)
-        usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
-        if attempt.estimate.sigma_px < max(least, to_usual * usual):
+        spread = attempt.estimate.sigma_px
+        to_usual = ALIKE_TO_USUAL if agree(attempt, UNHIDDEN) else CLOSE_TO_USUAL
+        mistakable = alike and spread > to_usual * self._usual_px
+        if not mistakable and spread < self._loosest_px(attempt, followed):
             return None
         visible, count = attempt.counts
         return Rejection(RejectionReason.LOOSE_AGREEMENT, count, visible, spread_px=attempt.estimate.sigma_px)
+
+    def _loosest_px(self, attempt: PoseHypothesis, followed: bool) -> float:
+        """The spread from which on the points that agree do so by chance, pixels; infinite where none is too large."""
+        usual = np.nan_to_num(self._usual_px)  # 0 where it was never followed yet
+        most, loosest = agree(attempt, MOST_AGREE), max(LOOSE_PX, LOOSE_TO_USUAL * usual)
+        if followed:
+            return np.inf if agree(attempt, self._options.least_share) else loosest
+        if not most:
+            return max(CLOSE_PX, CLOSE_TO_USUAL * usual)
+        return loosest if usual else np.inf
 
     def _known_by_map(self, attempt: PoseHypothesis) -> bool:
         """Whether the frame's camera and the map say where it is; a pose that is held says nothing of a frame."""
@@ -102,20 +122,78 @@ class Recovery:
         """Whether something else seems to be before the object."""
         return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
 
+    def unmistaken(self, picture: Image, attempt: PoseHypothesis) -> tuple[PoseHypothesis, Rejection | None]:
+        """The attempt after a loss, or what explains the frame better in a place that looks alike; or why neither.
+
+        A regular print that is shifted by a period agrees nearly everywhere.
+        """
+        if attempt.prior is not None or reject(attempt, self._options) is not None or attempt.outline_alone:
+            return attempt, self.reject(attempt, followed=False)
+        shifts = self._shifts(picture, attempt.estimate.state)
+        shifts = shifts[np.linalg.norm(shifts, axis=1) >= LARGEST_CORRECTION_PX]
+        places = [attempt, *self._shifted(picture, attempt.estimate.state, shifts)]
+        best, rejection = self._chosen(places, alike=len(shifts) > 0)
+        # A better place comes with a better shape, from which the right one may be in reach.
+        return (best, rejection) if best is attempt else self.unmistaken(picture, best)
+
+    def _chosen(self, places: list[PoseHypothesis], alike: bool) -> tuple[PoseHypothesis, Rejection | None]:
+        """The place that explains a frame best, and why it is not to be believed, if it is not."""
+        best, *others = sorted(places, key=lambda place: -int(place.inliers.sum()))
+        rival = next((other for other in others if self._apart(best, other) and self._about_as_good(other, best)), None)
+        if rival is None:
+            return best, self.reject(best, followed=False, alike=alike)
+        counts = int(best.inliers.sum()), int(rival.inliers.sum())
+        return best, Rejection(RejectionReason.TWO_PLACES, *counts)
+
+    def _shifts(self, picture: Image, state: State) -> Array:
+        """By how much (k, 2), pixels, the object in ``state`` has to be moved to where a frame looks like it."""
+        with stage("recover"):
+            return lookalike_shifts(picture.normalized, self._reference.rendered(state))
+
+    def _shifted(self, picture: Image, state: State, shifts: Array) -> list[PoseHypothesis]:
+        """The object moved from ``state`` in the image, where its points agree somehow."""
+        pose, places = state.camera_from_object, list[PoseHypothesis]()
+        depth = middle(self._reference.points.in_camera(state)[:, 2])
+        for shift in shifts / [self._camera.fx, self._camera.fy] * depth:
+            moved = RigidTransform(pose.rotation, pose.translation + np.append(shift, 0.0))
+            place = self._estimation.correct(picture, replace(state, camera_from_object=moved), None, None)
+            if reject(place, self._options) is None:
+                places.append(self._estimation.correct(picture, place.estimate.state, None, None))
+        return places
+
+    def _about_as_good(self, other: PoseHypothesis, best: PoseHypothesis) -> bool:
+        """Whether chance may have made more points agree with the best place than with another one.
+
+        Points that agree with one of both alone tell them apart; were both places right, they would fall to either
+        as a coin does. Points whose windows overlap count as one.
+        """
+        limit = np.linalg.norm(best.estimate.residuals[: len(best.inliers)][best.inliers], axis=1).max()
+        with np.errstate(invalid="ignore"):
+            close = np.linalg.norm(other.estimate.residuals[: len(other.inliers)], axis=1) <= limit
+        agreeing = other.inliers & close
+        for_best, for_other = int((best.inliers & ~agreeing).sum()), int((agreeing & ~best.inliers).sum())
+        return for_best - for_other < SIGNIFICANT * np.sqrt((for_best + for_other) * self._reference.redundancy)
+
     def recover(
-        self, picture: Image, last_shape: Array, rejection: Rejection, held: Prior | None = None
+        self, picture: Image, last: State, rejection: Rejection, held: Prior | None = None
     ) -> tuple[PoseHypothesis | None, Rejection | None]:
         """The object somewhere in the frame, or None and why it is lost.
 
         Parameters
         ----------
-        last_shape : (d,), the parameters known last.
+        last : its state known last.
         rejection : why it was not found by its last state.
         held : its pose, where this is one over the sequence; then the object can be nowhere else.
         """
-        found, matches = self._find(picture, self._shapes(last_shape), None, held)
-        if matches is not None:
-            return None, replace(rejection, then=Rejection(RejectionReason.FEW_FEATURES, matches))
+        found = None if held is not None else self._by_appearance(picture, last)
+        if found is None:
+            found, matches = self._find(picture, self._shapes(last.parameters), None, held)
+            if matches is not None:
+                return None, replace(rejection, then=Rejection(RejectionReason.FEW_FEATURES, matches))
+            if found is not None and held is None:
+                found, mistaken = self.unmistaken(picture, found)
+                if mistaken is not None:
+                    return None, replace(rejection, then=mistaken)
         if found is None or held is not None:
             return found, rejection if found is None else None
         other = self.another(picture, found)
@@ -145,7 +223,8 @@ class Recovery:
         with stage("recover"):
             covered = self._reference.covered(found.estimate.state)
             elsewhere = np.where(covered, 0, 255).astype(np.uint8)
-        other, _ = self._find(picture, self._shapes(found.estimate.state.parameters), elsewhere)
+        shapes = [found.estimate.state.parameters, self._model.default]  # it may rest
+        other, _ = self._find(picture, shapes, elsewhere)
         return other if other is not None and self._apart(found, other) else None
 
     def _find(
@@ -156,15 +235,24 @@ class Recovery:
             state, matches = self._reference.relocaliser.find(picture.grey, shapes, mask)
         if state is None:
             return None, matches
-        state = state if held is None else held.placed(state)
+        return self._settled(picture, state if held is None else held.placed(state), held), None
+
+    def _by_appearance(self, picture: Image, last: State) -> PoseHypothesis | None:
+        """The object in the place that looks most like it in its last state; None if it is not to be believed."""
+        places = self._shifted(picture, last, self._shifts(picture, last))
+        best, rejection = self._chosen(places, alike=True) if places else (None, None)
+        return None if best is None or rejection is not None else self._settled(picture, best.estimate.state, None)
+
+    def _settled(self, picture: Image, state: State, held: Prior | None) -> PoseHypothesis | None:
+        """The object near ``state``, in the shape that explains the frame best; None if it is not to be believed."""
         candidate = self._estimation.correct(picture, state, None, held)
         candidate = self._estimation.correct(picture, candidate.estimate.state, None, held)
         if reject(candidate, self._options) is not None:
-            return None, None
+            return None
         with stage("search"):
             better = self._estimation.best_of(candidate, self._starts(candidate))
         candidate = self._estimation.correct(picture, better.estimate.state, None, held)
-        return (candidate if self.reject(candidate, followed=False) is None else None), None
+        return candidate if self.reject(candidate, followed=False) is None else None
 
     def _starts(self, candidate: PoseHypothesis) -> list[State]:
         """Shapes spread over the box, each in the held pose, or where it fits the supporting points best."""

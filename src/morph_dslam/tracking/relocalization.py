@@ -40,6 +40,13 @@ class Relocalizer:
         surface, met = bind_pixels(drawn, estimator.camera, view, pixels)
         self._points = BoundPoints.from_surface(estimator.model, surface)
         self._descriptors = descriptors[met]
+        self._detected: tuple[NDArray[np.uint8], tuple[Array, NDArray[np.uint8]]] | None = None
+
+    def _features(self, grey: NDArray[np.uint8]) -> tuple[Array, NDArray[np.uint8]]:
+        """Features of a frame, detected once for all searches in it."""
+        if self._detected is None or self._detected[0] is not grey:
+            self._detected = grey, detect_orb(grey, N_FEATURES)
+        return self._detected[1]
 
     def find(
         self, grey: NDArray[np.uint8], shapes: list[Array], mask: NDArray[np.uint8] | None = None
@@ -56,7 +63,10 @@ class Relocalizer:
         -------
         None in place of the state when fewer matches than `LEAST_MATCHES` agree on one.
         """
-        pixels, descriptors = detect_orb(grey, N_FEATURES, mask)
+        pixels, descriptors = self._features(grey)
+        if mask is not None:
+            columns, rows = np.minimum(np.rint(pixels).astype(np.int64), [grey.shape[1] - 1, grey.shape[0] - 1]).T
+            pixels, descriptors = pixels[mask[rows, columns] > 0], descriptors[mask[rows, columns] > 0]
         mine, theirs = match_descriptors(self._descriptors, descriptors)
         if len(mine) < LEAST_MATCHES:
             return None, len(mine)

@@ -204,7 +204,7 @@ class Tracker:
             hypothesis = self._match(image, followed, prior)
             hypothesis = self._search(hypothesis)
             hypothesis = self._check_map(image, hypothesis, camera)
-            found_by, rejection = self._gate(hypothesis)
+            hypothesis, found_by, rejection = self._gate(image, hypothesis)
             if rejection is not None:
                 hypothesis, found_by, rejection = self._relocalize(image, hypothesis, rejection, camera)
             elif found_by is FoundBy.FLOW:
@@ -332,10 +332,13 @@ class Tracker:
         free = self._match(image, self._follow(image, None), None)
         return hypothesis if reject(free, self.options) is not None else free
 
-    def _gate(self, hypothesis: PoseHypothesis) -> tuple[FoundBy, Rejection | None]:
-        """Whether to accept the hypothesis; after a loss more is demanded."""
-        rejection = self._view.recovery.reject(hypothesis, followed=not self._lost)
-        return FoundBy.LAST_STATE if self._lost else FoundBy.FLOW, rejection
+    def _gate(self, image: Image, hypothesis: PoseHypothesis) -> tuple[PoseHypothesis, FoundBy, Rejection | None]:
+        """Whether to accept the hypothesis; after a loss more is demanded, and other places may be better."""
+        recovery = self._view.recovery
+        if not self._lost:
+            return hypothesis, FoundBy.FLOW, recovery.reject(hypothesis, followed=True)
+        hypothesis, rejection = recovery.unmistaken(image, hypothesis)
+        return hypothesis, FoundBy.LAST_STATE, rejection
 
     def _relocalize(
         self, image: Image, hypothesis: PoseHypothesis, rejection: Rejection, camera: CameraLocalization
@@ -345,7 +348,7 @@ class Tracker:
             return hypothesis, FoundBy.LAST_STATE, rejection
         if self._placed_by_map(camera) is not None and self._n_lost % self.options.look_every:
             return hypothesis, FoundBy.FEATURES, rejection
-        found, why = self._view.recovery.recover(image, self._last.parameters, rejection, self._still)
+        found, why = self._view.recovery.recover(image, self._last, rejection, self._still)
         return hypothesis if found is None else found, FoundBy.FEATURES, why
 
     def _reconsider(self, image: Image, hypothesis: PoseHypothesis) -> tuple[PoseHypothesis, FoundBy]:
