@@ -243,7 +243,7 @@ def test_an_object_that_is_found_by_its_features_keeps_the_pose():
     estimator, options = Estimator(model, given, EstimationOptions()), md.TrackerOptions(pose="still")
     view = ActiveView.of(ReferenceView(estimator, [PosedImage(rest, at_rest)], options), estimator, options)
     lost = Rejection(RejectionReason.FEW_FEATURES, 0)
-    found, why = view.recovery.recover(picture, model.default, lost, held(at_rest, estimator))
+    found, why = view.recovery.recover(picture, at_rest, lost, held(at_rest, estimator))
     assert why is None
     pose = found.estimate.state.camera_from_object
     assert np.abs(rotation_log(pose.rotation @ POSE.rotation.T)).max() < 1e-4
