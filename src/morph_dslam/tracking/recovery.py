@@ -37,6 +37,8 @@ MOST_SHAPES = 27
 #: Where other places look alike, it is not believed if its points spread more than so many times the usual; where fewer
 #: than `UNHIDDEN` of all agree, `CLOSE_TO_USUAL`.
 ALIKE_TO_USUAL = 5.0
+#: So many times a better place is looked for from a better one.
+MOST_ROUNDS = 3
 #: So many standard deviations tell two places apart.
 SIGNIFICANT = 3.0
 #: Share of the latest frame in the usual spread.
@@ -129,12 +131,17 @@ class Recovery:
         """
         if attempt.prior is not None or reject(attempt, self._options) is not None or attempt.outline_alone:
             return attempt, self.reject(attempt, followed=False)
-        shifts = self._shifts(picture, attempt.estimate.state)
-        shifts = shifts[np.linalg.norm(shifts, axis=1) >= LARGEST_CORRECTION_PX]
-        places = [attempt, *self._shifted(picture, attempt.estimate.state, shifts)]
-        best, rejection = self._chosen(places, alike=len(shifts) > 0)
+        best, rejection = attempt, None
         # A better place comes with a better shape, from which the right one may be in reach.
-        return (best, rejection) if best is attempt else self.unmistaken(picture, best)
+        for _ in range(MOST_ROUNDS):
+            attempt = best
+            shifts = self._shifts(picture, attempt.estimate.state)
+            shifts = shifts[np.linalg.norm(shifts, axis=1) >= LARGEST_CORRECTION_PX]
+            places = [attempt, *self._shifted(picture, attempt.estimate.state, shifts)]
+            best, rejection = self._chosen(places, alike=len(shifts) > 0)
+            if best is attempt:
+                break
+        return best, rejection
 
     def _chosen(self, places: list[PoseHypothesis], alike: bool) -> tuple[PoseHypothesis, Rejection | None]:
         """The place that explains a frame best, and why it is not to be believed, if it is not."""
