@@ -141,6 +141,36 @@ def test_pairs_of_another_recording_are_set_aside(tracked, videos):
     assert "(b.mp4)" in client.state()["notes"]["start"]
 
 
+def test_pairs_clicked_on_a_recording_that_another_page_has_replaced_are_not_saved(tracked, videos):
+    """By another name, under the same name, and with the number that a page loaded since has."""
+    client, folder = tracked
+    clicked = {"pairs": pairs_of(bent_sheet_model(), STATES[1]), "frame": 1, "at_rest": False}
+    for name, video in (("b.mp4", videos[1]), ("b.mp4", videos[0])):
+        number = client.state()["choices"].get("recording_number", 0)
+        client.call("save_start", **clicked, recording_number=number)
+        (folder / "landmarks.csv").unlink()
+        assert client.upload("recording", name, video) == 200
+        assert "was replaced while these pairs were clicked" in client.refused(
+            "save_start", **clicked, recording_number=number
+        )
+        assert not (folder / "landmarks.csv").exists()
+    client.call("save_start", **clicked, recording_number=client.state()["choices"]["recording_number"])
+    assert client.state()["done"]["start"]
+
+
+def test_every_page_is_told_of_another_recording(tracked, videos):
+    client, _ = tracked
+    uploaded = []
+
+    def is_told(name, content):
+        if not uploaded:
+            uploaded.append(client.upload("recording", "b.mp4", videos[1]))
+        return name == "recording"
+
+    assert client.events(is_told)[-1] == ("recording", "b.mp4")
+    assert uploaded == [200]
+
+
 def test_pairs_of_pictures_are_set_aside_with_them(empty):
     client, folder = empty
     data = [cv2.imencode(".png", np.full((24, 32, 3), 40 * k, np.uint8))[1].tobytes() for k in range(3)]

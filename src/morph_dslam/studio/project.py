@@ -229,7 +229,12 @@ class Project:
         if landmarks.is_file():
             landmarks.replace(self.path(EARLIER_LANDMARKS))
             self.choose(pairs_were_of=self.choices.get("recording", ""))
-        self.choose(reference_frame=None)
+        self.choose(reference_frame=None, recording_number=self.recording_number + 1)
+
+    @property
+    def recording_number(self) -> int:
+        """Another one whenever pairs that were clicked before mean nothing any more."""
+        return int(self.choices.get("recording_number", 0))
 
     @property
     def aside(self) -> str | None:

@@ -75,7 +75,7 @@ class Steps:
         self._changed.set()
 
     def recording_came(self) -> None:
-        """Tell the pages that a phone has brought a recording."""
+        """Tell the pages that there is another recording; another page, or a phone, may have brought it."""
         self._arrivals += 1
         self._tell()
 
@@ -190,6 +190,7 @@ class Steps:
             self._outdate_run_of(name)
         if replaces or self.project.choices.get("recording") != name:
             self.project.take_recording(name, is_another=replaces)
+            self.recording_came()
 
     def _outdate_run_of(self, name: str) -> None:
         """What has this name is replaced: a run of it, also one that is still tracked, is of what was there before."""
@@ -207,6 +208,7 @@ class Steps:
             self._outdate_run_of(folder)
             if self.project.choices.get("recording") == folder:
                 self.project.set_aside_pairs()
+                self.recording_came()
         for file in files:
             file.unlink()
         return {}
@@ -364,8 +366,12 @@ class Steps:
             self._needed(names.CAMERA, "calibrate the camera, or drop its file"),
         )
 
-    async def save_start(self, pairs: Pairs, frame: int, at_rest: bool) -> dict[str, Any]:
-        """Write landmarks.csv."""
+    async def save_start(
+        self, pairs: Pairs, frame: int, at_rest: bool, recording_number: int | None = None
+    ) -> dict[str, Any]:
+        """Write landmarks.csv; with the number of the recording that was clicked on, only if that is still the one."""
+        if recording_number not in (None, self.project.recording_number):
+            raise StudioError("the recording was replaced while these pairs were clicked: load this page again")
         await self._worker.call(clicks.save_clicks, pairs, self.project.path(names.LANDMARKS))
         self.project.choose(reference_frame=frame, at_rest=at_rest, pairs_were_of=None)
         return {"file": names.LANDMARKS}

@@ -15,7 +15,8 @@ const PLAIN = Array(256).fill([40, 170, 200]); // of an undeformed object, which
 
 export async function startStep(app) {
   app.panel.append(...title('Start', 'Where the object is: by four clicked pairs or more, or by a scan of the still scene.'));
-  const { recording, camera, done } = app.state;
+  const { recording, camera, done, choices } = app.state;
+  const recording_number = choices.recording_number ?? 0;
   if (!done.build || !recording || recording.message || !camera || camera.message) {
     app.panel.append(el('p', { className: 'problem' }, 'This step needs the model, the recording and the camera.'));
     return {};
@@ -58,7 +59,7 @@ export async function startStep(app) {
   const list = el('ul', { className: 'list', id: 'pairs' });
   const result = el('div', { id: 'fit' });
   const save = el('button', { id: 'save-start', className: 'main', onclick: () => app.doing(async () => {
-    await call('save_start', { pairs, frame: number, at_rest: atRest.checked });
+    await call('save_start', { pairs, frame: number, at_rest: atRest.checked, recording_number });
     saved = true;
     aside.hidden = true;
     await app.refresh();
@@ -82,7 +83,7 @@ export async function startStep(app) {
       dropZone('drop-landmarks', 'Drop landmarks.csv', 'x_mm, y_mm, z_mm, u_px, v_px', '.csv', ([file]) => app.doing(async () => {
         await upload('landmarks', file);
         pairs = (await call('start_files')).pairs;
-        await call('save_start', { pairs, frame: number, at_rest: atRest.checked });
+        await call('save_start', { pairs, frame: number, at_rest: atRest.checked, recording_number });
         aside.hidden = true;
         await app.refresh();
         await fit();
