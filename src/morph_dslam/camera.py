@@ -315,14 +315,19 @@ class Camera:
         self.check_image(image, where)
         return image[:, :, 0] if image.shape[2:] == (1,) else image
 
-    def check_depth(self, depth: NDArray, where: str) -> None:
-        """Raise CameraError, whose message begins with ``where``, unless it is a depth image of the camera's size."""
+    def checked_depth(self, depth: NDArray, where: str) -> NDArray:
+        """A depth image (h, w) of the camera's size; NaN where it is 0, which depth cameras write for unmeasured.
+
+        Raises CameraError, whose message begins with ``where``, if it is none.
+        """
         size = (self.height, self.width)
         if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or depth.shape != size:
             raise CameraError(
                 f"{where} is {_kind(depth)}: give metres as float32, {size} as the picture that it belongs to, NaN "
                 "where nothing was measured"
             )
+        unknown = depth == 0.0
+        return np.where(unknown, depth.dtype.type(np.nan), depth) if unknown.any() else depth
 
     def check_image(self, image: NDArray, where: str) -> None:
         """Raise CameraError unless ``image`` (height, width, ...) has the calibrated size."""

@@ -260,6 +260,22 @@ def test_depth_images_of_the_first_camera_count(model, rig_films):
     assert sight_line[True] < 0.5 * sight_line[False]
 
 
+def test_depth_of_zero_is_not_measured(model, rig_films):
+    """With holes in 30 % of the pixels the results are those of NaN there."""
+    found, film = {}, rig_films[0]
+    reference, *pictures = [film.frame(sheet_state(time)) for time in (0.0, *RIG_TIMES[:3])]  # with noise
+    for hole in (0.0, np.nan):
+        rng, options = np.random.default_rng(0), md.TrackerOptions(use_depth=True)
+        tracker = Tracker(model, FRONT.camera, Registration(model, sheet_state(0.0)), options, reference=reference)
+        for time, picture in zip(RIG_TIMES, pictures, strict=False):
+            depth = sheet_depth(model, sheet_state(time), rng, camera=FRONT.camera)
+            depth[rng.random(depth.shape) < 0.3] = hole
+            result = tracker.track(Frame(0, time, picture, depth=depth))
+        assert not result.warnings
+        found[str(hole)] = result.pose.matrix
+    np.testing.assert_array_equal(found["0.0"], found["nan"])
+
+
 class DepthFilm:
     """A recording of the first camera, with depth."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.errors import TrackingError
+from morph_dslam.errors import ArgumentError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
 from morph_dslam.tracking.known_values import KnownValues
@@ -120,3 +120,9 @@ def test_images_do_not_outweigh_a_sensor():
 def test_mistakes_of_a_program_are_one_message(values, message):
     with pytest.raises(TrackingError, match=message):
         Estimator(MODEL, CAMERA).known.tell(values)
+
+
+@pytest.mark.parametrize("value", ["10 mm", [0.01, 0.001], np.array([0.01, 0.001]), np.nan, None, (0.01, np.nan), ()])
+def test_what_is_no_number_is_not_known(value):
+    with pytest.raises(ArgumentError, match=r"the known 'arch' is .*: give a finite number in SI"):
+        Estimator(MODEL, CAMERA).known.tell({"arch": value})

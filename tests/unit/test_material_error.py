@@ -95,7 +95,7 @@ def test_points_off_the_surface_are_counted(tracked, tmp_path):
 
 def test_unmeasured_points_are_left_out_and_counted(tracked, compare):
     points = tracked[1]["points_mm"].copy()
-    points[1, :5] = np.nan
+    points[1, :3], points[1, 3:5] = np.nan, np.inf
     figures = summarise(compare(points_mm=points))
     assert figures["n_comparisons_without_measurement"] == 5
     assert figures["n_comparisons"] == 5 * 60 - 5

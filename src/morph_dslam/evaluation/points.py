@@ -40,7 +40,7 @@ class PointTruth:
 
 
 def load_truth(path: str | Path) -> PointTruth:
-    """Read a truth file, a NumPy archive with the arrays of `LAYOUT`.
+    """Read a truth file, a NumPy archive with the arrays of `LAYOUT`; a point that is not finite was not measured.
 
     Raises
     ------
@@ -77,7 +77,8 @@ def load_truth(path: str | Path) -> PointTruth:
         )
     if len(np.unique(frames)) != len(frames):
         raise EvaluationError(f"{path}: a frame number occurs twice")
-    return PointTruth(frames.astype(np.int64), points.astype(float) / 1000.0, pixels.astype(float), ~visible)
+    points = np.where(np.isfinite(points), points, np.nan).astype(float) / 1000.0
+    return PointTruth(frames.astype(np.int64), points, pixels.astype(float), ~visible)
 
 
 #: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.

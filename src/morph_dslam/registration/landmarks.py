@@ -147,7 +147,7 @@ def register_landmarks(
     precise = Estimator(model, camera)
     precise.box = estimator.box
     if depth is not None:
-        camera.check_depth(depth, "the depth")
+        depth = camera.checked_depth(depth, "the depth")
         # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
         sigma = max(best.sigma_px, LEAST_PX) if np.isfinite(best.sigma_px) else UNKNOWN_PX
         best = refine_by_depth(precise, bound, pixels, best.state, sigma, depth, depth_sigma)

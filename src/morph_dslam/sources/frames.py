@@ -31,7 +31,7 @@ class Frame:
     index : its number in the sequence
     timestamp : seconds, by the recording's clock where it has one, else since frame 0
     image : (h, w, 3) uint8, blue, green, red
-    depth : (h, w) metres along the optical axis, NaN where not measured; None without a depth camera
+    depth : (h, w) metres along the optical axis, NaN or 0 where not measured; None without a depth camera
     right : (h, w, 3) uint8, image of the right camera of a stereo pair; None without one
     captured : when a live frame came, seconds of `time.monotonic`; None in a recording
     """

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import TrackingError
+from morph_dslam.errors import ArgumentError, TrackingError, check_kind
 from morph_dslam.io.text import has_a_cell_for_each, read_csv
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
@@ -185,12 +186,14 @@ class KnownParameters:
         ------
         TrackingError
             If the model has no such parameter, or the value is not in its range.
+        ArgumentError
+            If a value is no finite number in SI, or that with its deviation.
         """
+        check_kind(known, Mapping, "what is known", "values by the parameter's name, {'pressure': 2e3}")
         names = [parameter.name for parameter in self._model.study_parameters]
         if wrong := [name for name in known if name not in names]:
             raise TrackingError(f"'{wrong[0]}' is not a parameter of the model: these are {', '.join(names) or 'none'}")
-        pairs = [value if isinstance(value, tuple) else (value, np.nan) for value in known.values()]
-        values = np.array(pairs, dtype=np.float64).reshape(-1, 2)
+        values = np.array([_told(name, value) for name, value in known.items()], dtype=np.float64).reshape(-1, 2)
         indices = np.array([names.index(name) for name in known], dtype=np.int64)
         for k, (value, deviation) in zip(indices.tolist(), values, strict=True):
             check_known("known parameters", self._model, k, value, deviation)
@@ -215,3 +218,16 @@ class KnownParameters:
         information = self.squared_px / self._now[:, 1] ** 2
         away = parameters[self.indices] - self._now[:, 0]
         return 0.5 * float(information @ away**2), information, information * away
+
+
+def _told(name: str, value: object) -> tuple[float, float]:
+    """A value and its standard deviation, NaN where none is given; raises ArgumentError unless they are finite."""
+    numbers = [
+        float(one) if isinstance(one, Real) else np.nan for one in (value if isinstance(value, tuple) else (value,))
+    ]
+    if len(numbers) not in (1, 2) or not np.isfinite(numbers).all():
+        raise ArgumentError(
+            f"the known '{name}' is {value!r}: give a finite number in SI, or a tuple of it and its standard "
+            "deviation; what is not known now is left out"
+        )
+    return numbers[0], numbers[1] if len(numbers) == 2 else np.nan

@@ -231,6 +231,8 @@ class Tracker:
         ------
         TrackingError
             If the model has no such parameter, or a value is not in its range.
+        ArgumentError
+            If a value is no finite number, or that with its deviation.
         """
         self.estimator.known.tell(values)
 

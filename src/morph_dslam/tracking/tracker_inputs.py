@@ -133,8 +133,7 @@ def occluders_of(given: object, camera: Camera, undistortion: Maps | None) -> ND
             hidden = cv2.remap(hidden, *undistortion, interpolation=cv2.INTER_NEAREST)
         # Whatever the object's own depth is, it is in front.
         return widened(np.where(hidden > 0, np.float32(0.0), np.float32(np.inf)))
-    camera.check_depth(given, where)  # type: ignore[arg-type]
-    depth = np.asarray(given, dtype=np.float32)
+    depth = camera.checked_depth(given, where).astype(np.float32, copy=False)  # type: ignore[arg-type]
     known = depth > 0.0
     return depth if known.all() else np.where(known, depth, np.float32(np.inf))
 
@@ -169,7 +168,7 @@ class Picture:
         check_time(frame, where)
         depth = frame.depth if use_depth else None
         if depth is not None:
-            camera.check_depth(depth, f"the depth of {where}")
+            depth = camera.checked_depth(depth, f"the depth of {where}")
         return cls(camera.checked_picture(frame.image, where), depth)
 
     @property
