@@ -407,7 +407,7 @@ def test_a_frame_missing_in_one_camera_of_a_rig_leaves_a_gap(rig_recording_of_sh
     next((folder / "aside").glob("*2.png")).unlink()
     assert run_command(with_both_cameras(folder, tmp_path / "run")) == 0
     said = capsys.readouterr().out
-    assert "the cameras recorded 5, 4 frames: 4 were tracked, 1 before the end" in said
+    assert "the cameras recorded 5, 4 frames: 4 were tracked, to the end of the shortest recording, without 1 " in said
     run = load_run(tmp_path / "run")
     assert run.frames.tolist() == [0, 1, 3, 4]
     assert len(md.open_source(tmp_path / "run" / "augmented.mp4")) == 4

@@ -251,7 +251,7 @@ class NodalForces:
         slopes = np.zeros((len(self._symbols), 3, self._n_scalar))
         for load, share in zip(self._loads, self._shares, strict=True):
             slopes += np.column_stack([self._symbols.slopes(f) for f in load.force])[:, :, None] * share
-        return slopes.reshape(len(self._symbols), -1)
+        return slopes.reshape(len(self._symbols), 3 * self._n_scalar)
 
 
 #: A reaction that never exceeds so much of the largest is rounding, and has nothing to be reduced; nor has one that

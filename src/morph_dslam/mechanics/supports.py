@@ -75,7 +75,7 @@ class Constraints:
                 + coordinate_slopes[:, dofs] @ affine.matrix[component]
                 + affine.shift_slopes[:, component, None] * self._constant[dofs]
             )
-        return result.reshape(len(self._symbols), -1)
+        return result.reshape(len(self._symbols), 3 * self._space.n_scalar)
 
     def _centroid(self, motion: PrescribedMotion) -> tuple[Array, Array]:
         """Mean (3,) of the nodes of the set that a motion is centred on, and its derivatives (d, 3)."""

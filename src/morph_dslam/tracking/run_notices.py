@@ -106,8 +106,8 @@ class RunWarning(StrEnum):
         "object"
     )
     UNEQUAL_RECORDINGS = (
-        "the cameras recorded {counts} frames: {tracked} were tracked, {left_out} before the end of the shortest "
-        "recording were left out, because a camera has none of that number"
+        "the cameras recorded {counts} frames: {tracked} were tracked, to the end of the shortest recording, without "
+        "{left_out} that a camera has not recorded"
     )
 
 
