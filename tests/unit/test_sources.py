@@ -2,7 +2,6 @@
 
 import re
 import struct
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from morph_dslam.extend import register_source
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
 from morph_dslam.sources.frames import check_range, notes_of_source
+from tests.support.full_disk import largest_file
 from tests.support.real_data import ROOT, real_data
 
 
@@ -495,27 +495,15 @@ def test_no_frames_no_file_and_the_older_video_stays(tmp_path):
     assert len(list(open_source(tmp_path / "out.mp4"))) == 3
 
 
-@contextmanager
-def files_up_to(n_bytes):
-    """Files cannot grow beyond that, as on a full disk."""
-    resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def test_video_on_a_full_disk_is_an_error_and_leaves_nothing_that_does_not_play(tmp_path):
     write_video(tmp_path / "out.mp4", 1)
-    with files_up_to(1024), pytest.raises(SourceError, match="was not written whole, it is left out"):
+    with largest_file(1024), pytest.raises(SourceError, match="was not written whole, it is left out"):
         write_video(tmp_path / "out.mp4", 40)
     assert not list(tmp_path.iterdir())
 
 
 def test_interrupt_goes_on_where_the_video_is_lost_as_well(tmp_path, caplog):
-    with files_up_to(1024), pytest.raises(KeyboardInterrupt):
+    with largest_file(1024), pytest.raises(KeyboardInterrupt):
         write_video(tmp_path / "out.mp4", 40, KeyboardInterrupt())
     assert "was not written whole" in caplog.text
 

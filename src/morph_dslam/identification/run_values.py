@@ -49,22 +49,19 @@ def values_of_run(folder: Path, run: Run, names: Collection[str], measured: bool
     scale = np.array([of_model[each["name"]].display(1.0) for each in taken])
     values, std = (np.array([each[key] for each in taken]) / scale for key in ("value", "standard_deviation"))
     kept = tuple(each["name"] for each in taken)
-    return KnownValues(kept, values, np.outer(std, std) * _correlation(run, kept, measured)), []
+    covariance = _covariance(run, kept)
+    if covariance is None:  # k times the variances is never less than a covariance, whatever it is
+        covariance = (len(kept) if measured else 1) * np.diag(std**2)
+    return KnownValues(kept, values, covariance), []
 
 
-def _correlation(run: Run, names: Sequence[str], measured: bool) -> Array:
-    """(k, k) of what the last tracked frame tells of parameters.
-
-    Of a run that has not kept any it is k times the identity where something else was ``measured``: that is never less
-    than a correlation, whatever it is.
-    """
+def _covariance(run: Run, names: Sequence[str]) -> Array | None:
+    """(k, k), SI, of parameters in the last tracked frame; None of a run that has not kept any."""
     if run.covariances is None or not run.tracked.any():
-        return (len(names) if measured else 1) * np.eye(len(names))
+        return None
     every = [parameter.name for parameter in run.model.parameters]
     rows = [every.index(name) for name in names]
-    covariance = run.covariances[np.flatnonzero(run.tracked)[-1]][np.ix_(rows, rows)]
-    std = np.sqrt(np.diag(covariance))
-    return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
+    return run.covariances[np.flatnonzero(run.tracked)[-1]][np.ix_(rows, rows)]
 
 
 def _at_the_end(parameter: Parameter | None, value: float) -> str | None:

@@ -182,7 +182,7 @@ class Relocalizer:
             group = self.group(number)
             places = self._places(group, view, corners, tracker)
             if places:
-                places += self._places(self._lookalikes(group, corners), view, corners, tracker)
+                places += self._places(self._similar_keyframes(group, corners), view, corners, tracker)
                 return self._chosen(places, view, tracker)
         return NoPose(SlamReason.NO_SIMILAR_KEYFRAME)
 
@@ -202,7 +202,7 @@ class Relocalizer:
             distances[away < ROUGH_PX] = np.iinfo(distances.dtype).max
         return places
 
-    def _lookalikes(self, group: Indices, corners: Corners) -> Indices:
+    def _similar_keyframes(self, group: Indices, corners: Corners) -> Indices:
         """The group of the likeliest other keyframe; none if there is none."""
         likeness = self.places.similarities(corners.descriptors)
         likeness[group] = 0.0

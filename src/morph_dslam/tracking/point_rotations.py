@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from morph_dslam.geometry import rotation_log
+from morph_dslam.geometry import fit_similarity, rotation_log
 from morph_dslam.model import MaterialPoints, ReducedModel, SeparatedField
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.tracking.estimator import Estimate
@@ -92,14 +92,12 @@ def turn_of(rest: Array, moved: Array, slopes: Array) -> tuple[Array, Array]:
     by_parameters : (3, d) derivatives of a small turn that is added, from the left.
     """
     b = rest - rest.mean(axis=0)
-    left, sizes, right = np.linalg.svd((moved - moved.mean(axis=0)).T @ b)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = np.ascontiguousarray((left * signs) @ right)
-    stretch = (left * (sizes * signs)) @ left.T
+    rotation = fit_similarity(rest, moved, with_scale=False).rotation
+    stretch = (moved - moved.mean(axis=0)).T @ b @ rotation.T
     changes = np.einsum("dni,nj->dij", slopes, b) @ rotation.T
     skew = changes - changes.transpose(0, 2, 1)
     axial = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]])
-    return rotation_log(rotation), np.linalg.solve(np.trace(stretch) * np.eye(3) - stretch, axial)
+    return rotation_log(np.ascontiguousarray(rotation)), np.linalg.solve(np.trace(stretch) * np.eye(3) - stretch, axial)
 
 
 def _cells_about(model: ReducedModel) -> scipy.sparse.csr_array:

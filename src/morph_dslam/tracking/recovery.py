@@ -14,13 +14,13 @@ from morph_dslam.registration.landmarks import shape_starts, solve_pnp
 from morph_dslam.timing import stage
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, agree, reject
-from morph_dslam.tracking.lookalikes import lookalike_shifts
 from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.state import Prior, State
+from morph_dslam.tracking.template_matching import matching_shifts
 
 Array = NDArray[np.float64]
 #: An object that is found anew is believed if half of its points agree, or if they agree as closely as this,
@@ -155,7 +155,7 @@ class Recovery:
     def _shifts(self, picture: Image, state: State) -> Array:
         """By how much (k, 2), pixels, the object in ``state`` has to be moved to where a frame looks like it."""
         with stage("recover"):
-            return lookalike_shifts(picture.normalized, self._reference.rendered(state))
+            return matching_shifts(picture.normalized, self._reference.rendered(state))
 
     def _shifted(self, picture: Image, state: State, shifts: Array) -> list[PoseHypothesis]:
         """The object moved from ``state`` in the image, where its points agree somehow."""

@@ -1,4 +1,4 @@
-"""Places of a frame that look like the object as it is rendered: a print may repeat itself, and so may the object."""
+"""Template matching: places of a frame that look like the object as it is rendered, of which there may be several."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_PLACES, LEAST_ALIKE, SHARE_OF_BEST = 9, 0.2, 0.5
 APART = 3
 
 
-def lookalike_shifts(frame: NDArray[np.uint8], rendering: Rendering) -> Array:
+def matching_shifts(frame: NDArray[np.uint8], rendering: Rendering) -> Array:
     """By how much (k, 2) the rendered object would have to be moved in the image, pixels, the likeliest first.
 
     Parameters
