@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from morph_dslam import load_model, make_study
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import StudyError
@@ -78,6 +79,44 @@ def test_a_support_moves_with_time(tmp_path: Path) -> None:
         stress = 3e6 * 1e-4 / 5.0 * (0.4 * time + 0.6 * relaxing)
         found = model.von_mises(np.array([time]), "solid")
         assert found == pytest.approx(np.full(len(model.nodes), stress), rel=5e-4)
+
+
+def test_a_stroke_that_grows_and_stays_is_tracked_by_forces_over_paths(tmp_path: Path) -> None:
+    """Without contraction P = E / 2 (s - 1 / s) at once; S = P / s relaxes, integrated in 8000 lines (Boltzmann)."""
+    pulled = [*SIDES, {"kind": "displacement", "on": "z_max", "z": "load * ramp"}]
+    ramp = {"times": ["0 s", "2 s", "12 s", "13 s"], "values": [0.0, 1.0, 1.0, 0.4]}
+    content = VARIED | {
+        "materials": {
+            "rubber": {
+                "law": "neo_hookean",
+                "young": "3 MPa",
+                "poisson": 0.0,
+                "prony": {"relative_moduli": [0.6], "times": ["2 s"]},
+            }
+        },
+        "mesh": {"generator": "block", "size": ["10 mm", "10 mm", "20 mm"], "divisions": [1, 1, 1], "cells": "hex8"},
+        "time": {"parameter": "held", "step": "0.25 s", "amplitudes": {"ramp": ramp}},
+        "supports": pulled,
+        "parameters": {"held": VARIED["parameters"]["held"], "load": VARIED["parameters"]["load"]},
+        "sampling": {"training": 8, "held_out": 4},
+        "reduction": {"tolerance": 4e-3},
+    }
+    model = md.build(make_study(content))
+    assert model.certificate["reduction"]["paths"] == 8
+    times = np.linspace(0.0, 20.0, 8001)
+    for load in (2e-3, 6e-3):
+        stretch = 1.0 + load / 0.02 * np.interp(times, [0.0, 2.0, 12.0, 13.0], ramp["values"])
+        at_once = 3e6 / 2.0 * (1.0 - 1.0 / stretch**2)
+        fade = np.exp(-np.diff(times)[0] / 2.0)
+        relaxing = [0.0]
+        for change in np.diff(at_once):
+            relaxing.append(fade * relaxing[-1] + np.sqrt(fade) * change)
+        force = 1e-4 * stretch * (0.4 * at_once + 0.6 * np.array(relaxing))
+        found = [
+            model.at({"held": t, "load": load}).reactions()["force_z_max"][2] for t in (1.0, 2.0, 2.3, 5, 12.5, 13, 17)
+        ]
+        wanted = np.interp([1.0, 2.0, 2.3, 5.0, 12.5, 13.0, 17.0], times, force)
+        np.testing.assert_allclose(found, wanted, atol=6e-3 * np.abs(force).max())
 
 
 #: The same bar with what may change from sample to sample: at t = 0 none of it is any default's.

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.model import Parameter
-from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.affine import Amplitudes, read_affine
 from morph_dslam.units import from_si, read_quantity, to_si
 
 PARAMETERS = (
@@ -74,7 +75,7 @@ def test_expression_is_the_same_function_of_other_variables():
         ("load / 0 kPa", "ratio", r"not by zero"),
         ("load / 2", "ratio", r"is not a number with a unit, nor a sum"),
         ("tilt / 2 deg", "angle", r"the parameter tilt is of ratio, and angle is wanted"),
-        ("load * load", "stress", r"is not a number with a unit, nor a sum"),
+        ("load * load", "stress", r"multiplies by 'load', which is no amplitude of \[time\]; the study has none"),
         ("3 MPa 4", "stress", r"is not a number with a unit, nor a sum"),
         ("", "stress", r"an empty text"),
         ("load +", "stress", r"is not a number with a unit, nor a sum"),
@@ -135,3 +136,38 @@ def test_a_text_that_is_no_force_is_refused(text):
 def test_a_unit_of_another_quantity_is_refused_with_those_that_fit():
     with pytest.raises(StudyError, match="'mm' is not a unit of angle; use one of rad, deg"):
         to_si(1.0, "mm", "angle")
+
+
+RAMP = Amplitudes(2, {"ramp": Amplitude((0.0, 1.0), (0.0, 3.0))})
+
+
+@pytest.mark.parametrize(
+    ("text", "quantity", "value", "used"),
+    [
+        ("load * ramp", "pressure", 3000.0, {0, 2}),
+        ("0.5 * load * ramp + 2 kPa", "stress", 3500.0, {0, 2}),
+        ("10 N * share * ramp", "force", 3.75, {1, 2}),
+        ("16 mm * ramp", "length", 0.024, {2}),
+        ("3 mm * load / 4 kPa * ramp - 1 mm", "length", 0.00125, {0, 2}),
+        ("1 - ramp", "ratio", -0.5, {2}),
+    ],
+)
+def test_terms_are_multiplied_by_amplitudes(text, quantity, value, used):
+    """The third parameter stands for the time: at 0.5 the ramp is at 1.5."""
+    found = read_affine(text, quantity, PARAMETERS, RAMP)
+    assert found(MU) == pytest.approx(value, rel=1e-14)
+    assert (found.used, found.fixed) == (used, False)
+    assert found.expression(MU, {"ramp": 1.5}) == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("load * share", "multiplies by 'share', which is no amplitude of [time]; the amplitudes are ramp"),
+        ("ramp * ramp", "names 'ramp', which is no parameter"),
+        ("ramp", "lacks a unit of pressure"),
+    ],
+)
+def test_other_products_are_refused(text, message):
+    with pytest.raises(StudyError, match=re.escape(message)):
+        read_affine(text, "pressure", PARAMETERS, RAMP)

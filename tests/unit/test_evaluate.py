@@ -39,6 +39,7 @@ def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(ru
         "mean_mm=5.000 median_mm=5.000 p95_mm=5.000 tracked=5/6 median_ms=9.00 p95_ms=9.00 rigid_mm=0.000"
     )
     assert "note: truth frames that were not tracked and so not compared: 12" in lines
+    assert not any("frame number" in line for line in lines)
     figures = json.loads((run / "evaluation.json").read_text())
     assert figures["mean_mm"] == pytest.approx(5.0, abs=1e-3)
     assert figures["truth_frames_not_tracked"] == [12]
@@ -90,6 +91,23 @@ def test_results_in_memory_are_compared_with_points(results):
     assert figures["mean_mm"] == pytest.approx(5.0, abs=1e-3)
     assert (figures["n_frames_tracked"], figures["truth_frames_not_tracked"]) == (5, [12])
     assert figures["median_ms"] == pytest.approx(7.0)
+
+
+def test_frames_that_are_counted_from_one_are_named(results, run_and_truth, capsys):
+    run, path = run_and_truth
+    truth = exact_truth(results[10].model)
+    np.savez(path, **truth | {"frame": truth["frame"] + 1})
+    assert main(["evaluate", str(run), "--points", str(path)]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "frame number" in line]
+    assert len(said) == 1
+    assert said[0].startswith("note: with one less in each frame number of the truth the mean error is ")
+
+
+def test_points_in_another_unit_are_refused(results, tmp_path):
+    truth = exact_truth(results[10].model)
+    np.savez(tmp_path / "truth.npz", **truth | {"points_mm": 1e-3 * truth["points_mm"]})
+    with pytest.raises(EvaluationError, match="give points_mm in mm"):
+        md.evaluate(md.Run.of(CAMERA, results), tmp_path / "truth.npz")
 
 
 def test_results_that_make_no_run_are_refused(results):

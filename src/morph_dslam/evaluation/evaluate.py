@@ -15,6 +15,7 @@ from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_dep
 from morph_dslam.evaluation.force import force_error, summarise_force
 from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
+from morph_dslam.evaluation.point_notes import frame_notes
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.trajectory import summarise_alignment
@@ -50,6 +51,7 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
     figures = {
         **summarise(error),
         **summarise_alignment(error),
+        "notes": frame_notes(tracked, points, error),
         "truth": None if isinstance(truth, PointTruth) else str(truth),
         **_counts(tracked),
         "median_ms": float(np.nanmedian(tracked.frame_times)),

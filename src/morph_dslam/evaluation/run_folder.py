@@ -210,7 +210,7 @@ def remarks(figures: Mapping[str, Any]) -> list[str]:
             f"{figures['n_points_bound_at_outline']} truth points missed the surface by up to "
             f"{figures['outline_tolerance_px']:g} px and were bound to its outline"
         )
-    return lines
+    return [*lines, *figures.get("notes", [])]
 
 
 def alignment_line(figures: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ Any arithmetic on a symbol is an expression that NGSolve evaluates and different
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
@@ -28,19 +29,33 @@ Scalar = Any
 
 
 class ParameterSymbols:
-    """The d parameters of a study with a present value each, at first the default."""
+    """The d parameters of a study with a present value each, at first the default.
 
-    def __init__(self, parameters: Sequence[Parameter] = ()) -> None:
-        self.parameters = tuple(parameters)
+    Parameters
+    ----------
+    parameters : of the study.
+    clock : name of the one that is the time; empty if none is.
+    amplitudes : functions of the time by their names. Their symbols follow the time, and expressions of them are not
+        differentiated by it.
+    """
+
+    def __init__(
+        self, parameters: Sequence[Parameter] = (), clock: str = "", amplitudes: Mapping[str, Amplitude] | None = None
+    ) -> None:
+        self.parameters, self.clock, self.amplitudes = tuple(parameters), clock, dict(amplitudes or {})
         self._symbols = {p.name: ngs.Parameter(p.default) for p in self.parameters}
         if len(self._symbols) < len(self.parameters):
             raise StudyError("two parameters have the same name; parameter names must differ")
+        self._amplitudes = {name: ngs.Parameter(0.0) for name in self.amplitudes}
+        self._follow_time()
 
     def __len__(self) -> int:
         return len(self.parameters)
 
     def __getitem__(self, name: str) -> ngs.Parameter:
-        """The symbol of a parameter. Raises StudyError if there is none of this name."""
+        """The symbol of a parameter or an amplitude. Raises StudyError if there is none of this name."""
+        if name in self._amplitudes:
+            return self._amplitudes[name]
         if name not in self._symbols:
             known = ", ".join(self._symbols) or "none"
             raise StudyError(f"there is no parameter '{name}'; there are: {known}")
@@ -64,6 +79,12 @@ class ParameterSymbols:
         """Make ``mu`` (d,), SI, the present values."""
         for symbol, value in zip(self._symbols.values(), np.atleast_1d(mu), strict=True):
             symbol.Set(float(value))
+        self._follow_time()
+
+    def _follow_time(self) -> None:
+        """Give the amplitudes' symbols their values at the present time."""
+        for name, amplitude in self.amplitudes.items():
+            self._amplitudes[name].Set(float(amplitude(self._symbols[self.clock].Get())))
 
     def value(self, expression: Scalar) -> float:
         """Value of an expression that does not vary in space, at the present parameters."""

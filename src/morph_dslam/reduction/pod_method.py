@@ -1,8 +1,8 @@
 """The method "pod": modes of the snapshots, functions of the parameters through their coefficients.
 
-Snapshots over the whole range of a single parameter are interpolated by piecewise cubics, and those on a full, evenly
-spaced grid by splines. Scattered ones are fitted by polynomials of the total degree that predicts left-out samples
-best, with sensitivities where they are known.
+Snapshots over the whole range of a single parameter are interpolated by piecewise cubics, those on a full, evenly
+spaced grid by splines, and those on paths in time by splines in time. Scattered ones are fitted by polynomials of the
+total degree that predicts left-out samples best, with sensitivities where they are known.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions, ParameterFunctions
 from morph_dslam.reduction.grid_functions import EvenGrid, functions_on_grid
 from morph_dslam.reduction.line_functions import covers, interpolate_line
+from morph_dslam.reduction.path_functions import TimePaths, fit_paths
 from morph_dslam.reduction.pod import Pod, Truncation, compute_pod, truncate
 from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.regression import fit_functions
@@ -42,7 +43,8 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
     """
     snapshots, line = task.snapshots, covers(task.samples, task.box)
     grid = None if line else EvenGrid.of(task.samples, task.box)
-    _check_choices(task, line or grid is not None)
+    paths = None if line or grid is not None else TimePaths.of(task.samples, task.parameters)
+    _check_choices(task, line or grid is not None, paths is not None)
     through = task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
     fields, summaries = {}, {}
     for name in tqdm(task.field_names, desc="modes and functions", unit="field"):
@@ -57,6 +59,8 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
         coefficients = coefficients @ kept.rotation.T
         if grid is not None and through:
             functions, summary = _on_grid(task, grid, coefficients)
+        elif paths is not None and through:
+            functions, summary = _on_paths(task, paths, coefficients)
         else:
             make = _on_line if line and through else _fitted
             functions, summary = make(task, coefficients, _slopes(snapshots, name, pod, kept))
@@ -65,7 +69,7 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
     return task.model(fields, {"method": "pod", **summaries["displacement"]})
 
 
-def _check_choices(task: ReductionTask, ordered: bool) -> None:
+def _check_choices(task: ReductionTask, ordered: bool, on_paths: bool) -> None:
     """Refuse functions that these samples do not allow; ``ordered`` samples cover a range or a grid."""
     options = task.options
     if options.basis not in (None, "chebyshev", *GRID_BASES):
@@ -73,7 +77,7 @@ def _check_choices(task: ReductionTask, ordered: bool) -> None:
             f'reduction.method = "pod" has no functions "{options.basis}": use "chebyshev", on samples of one '
             'parameter and grids "cubic_spline" or "hat", or method = "sparse_pgd", which has all of them'
         )
-    if options.basis in GRID_BASES and not ordered:
+    if options.basis in GRID_BASES and not (ordered or on_paths):
         raise StudyError(
             f'reduction.basis = "{options.basis}" interpolates samples that cover the box, at least 4 along each '
             'parameter, on a grid all of them solved: use sampling.scheme = "adaptive" or "even" (one parameter) or '
@@ -121,13 +125,35 @@ def _on_grid(task: ReductionTask, grid: EvenGrid, coefficients: Array) -> tuple[
     return functions, {"format": form, "basis": basis, "grid": list(grid.counts)}
 
 
+def _on_paths(task: ReductionTask, paths: TimePaths, coefficients: Array) -> tuple[Functions, dict[str, Any]]:
+    """Splines in time through polynomials of the other parameters, of coefficients (n_snapshots, n_modes)."""
+    options = task.options
+    weights, tolerance = _weights(task, paths.clock), SHARE * options.tolerance
+    functions, errors = fit_paths(
+        paths, task.samples, coefficients, task.box, options.max_degree, weights, tolerance, options.basis
+    )
+    return functions, {
+        "format": "tensor_train",
+        "basis": options.basis or "cubic_spline",
+        "paths": len(paths.rows),
+        "instants": len(paths.instants),
+        "degrees": [basis.size - 1 for k, basis in enumerate(functions.bases) if k != paths.clock],
+        "cross_validation": {str(degree): error for degree, error in errors.items()},
+    }
+
+
+def _weights(task: ReductionTask, clock: int | None = None) -> Array:
+    """Of the samples (n,) in a regression; those at the defaults of all but the ``clock`` count more."""
+    defaults = np.array([p.default for p in task.parameters])
+    close = np.isclose(task.samples, defaults, rtol=0.0, atol=1e-9 * np.ptp(task.box, axis=1))
+    if clock is not None:
+        close[:, clock] = True
+    return np.where(close.all(axis=1), DEFAULT_WEIGHT, 1.0)
+
+
 def _fitted(task: ReductionTask, coefficients: Array, slopes: Array | None) -> tuple[Functions, dict[str, Any]]:
     """Polynomials fitted to the coefficients (n_snapshots, n_modes) of a field at scattered samples."""
     options, box = task.options, task.box
-    at_defaults = np.isclose(
-        task.samples, [p.default for p in task.parameters], rtol=0.0, atol=1e-9 * np.ptp(box, axis=1)
-    )
-    weights = np.where(at_defaults.all(axis=1), DEFAULT_WEIGHT, 1.0)
     lower, upper = box.T
     functions, errors = fit_functions(
         task.samples,
@@ -138,7 +164,7 @@ def _fitted(task: ReductionTask, coefficients: Array, slopes: Array | None) -> t
         options.max_degree,
         task.labels,
         raise_single=True,
-        weights=weights,
+        weights=_weights(task),
     )
     summary = {
         "format": options.format or "polynomial",

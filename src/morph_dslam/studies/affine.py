@@ -2,20 +2,21 @@
 
 "3 MPa" is a number, "pressure" the parameter of that name, "0.5 * pressure + 2 kPa" and "10 N * share" (of a
 parameter without unit) are sums of both. A parameter over a quantity of its own kind is a ratio, as in
-"5 kPa * held / 2 s".
+"5 kPa * held / 2 s". A term may end with an amplitude, which it is multiplied by as time runs: "stroke * ramp".
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.model import Parameter
 from morph_dslam.units import FACTORS, quantity_of, to_si
 
@@ -28,46 +29,103 @@ _WORD = r"[A-Za-z_][\w./]*"
 _TERM = re.compile(
     rf"(?:(?P<number>{_NUMBER})(?:\s+(?P<unit>{_WORD}))?(?:\s*\*\s*(?P<factor>{_WORD}))?|(?P<name>{_WORD}))"
     rf"(?:\s*/\s*(?P<divisor>{_NUMBER})\s+(?P<divisor_unit>{_WORD}))?"
+    rf"(?:\s*\*\s*(?P<amplitude>{_WORD}))?"
 )
 
 
 @dataclass(frozen=True)
+class Amplitudes:
+    """Those that a study has.
+
+    Attributes
+    ----------
+    clock : index of the parameter that is the time.
+    functions : by name.
+    """
+
+    clock: int = -1
+    functions: Mapping[str, Amplitude] = field(default_factory=dict)
+
+
+#: Of a study that has none.
+NO_AMPLITUDES = Amplitudes()
+
+
+@dataclass(frozen=True)
+class Product:
+    """factor * parameter * amplitude(time).
+
+    Attributes
+    ----------
+    factor : SI.
+    index : of the parameter; None for a factor alone.
+    name, amplitude : of the amplitude.
+    clock : index of the time.
+    """
+
+    factor: float
+    index: int | None
+    name: str
+    amplitude: Amplitude
+    clock: int
+
+    def __call__(self, mu: Array) -> float:
+        parameter = 1.0 if self.index is None else float(mu[self.index])
+        return self.factor * parameter * float(self.amplitude(mu[self.clock]))
+
+
+@dataclass(frozen=True)
 class Affine:
-    """constant + slopes . mu.
+    """constant + slopes . mu, and products with amplitudes.
 
     Attributes
     ----------
     constant : SI.
     slopes : (d,) by the parameters, SI.
+    products : that are added.
     """
 
     constant: float
     slopes: tuple[float, ...]
+    products: tuple[Product, ...] = ()
 
     def __call__(self, mu: Array) -> float:
-        return self.constant + float(np.dot(self.slopes, mu))
+        return self.constant + float(np.dot(self.slopes, mu)) + sum(product(mu) for product in self.products)
+
+    @property
+    def used(self) -> set[int]:
+        """Indices of the parameters that change it."""
+        in_products = {k for product in self.products for k in (product.index, product.clock) if k is not None}
+        return {int(k) for k in np.flatnonzero(self.slopes)} | in_products
 
     @property
     def fixed(self) -> bool:
         """Whether no parameter changes it."""
-        return not any(self.slopes)
+        return not self.used
 
-    def expression(self, parameters: Sequence[Any]) -> Any:
+    def expression(self, parameters: Sequence[Any], amplitudes: Mapping[str, Any] | None = None) -> Any:
         """The same in other variables, `ngs.Parameter` say: a number if fixed, else a sum over them."""
         result: Any = self.constant
         for slope, parameter in zip(self.slopes, parameters, strict=True):
             if slope:
                 result = result + slope * parameter
+        for product in self.products:
+            factor = product.factor * (amplitudes or {})[product.name]
+            result = result + (factor if product.index is None else factor * parameters[product.index])
         return result
 
 
-def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter]) -> Affine:
+def read_affine(
+    value: Any, quantity: str | None, parameters: Sequence[Parameter], amplitudes: Amplitudes = NO_AMPLITUDES
+) -> Affine:
     """An expression of a study file.
 
     Parameters
     ----------
     value : a text; for ratios a number too.
     quantity : a key of `morph_dslam.units.FACTORS` that it must measure; None: whatever its first term does.
+    parameters : that it may name.
+    amplitudes : that its terms may be multiplied by.
 
     Raises
     ------
@@ -83,14 +141,35 @@ def read_affine(value: Any, quantity: str | None, parameters: Sequence[Parameter
         return Affine(possible(float(value), str(value)), (0.0,) * len(parameters))
     known = {parameter.name: index for index, parameter in enumerate(parameters)}
     quantity = quantity or _own_quantity(value, known, parameters)
-    constant, slopes = 0.0, np.zeros(len(parameters))
+    constant, slopes, products = 0.0, np.zeros(len(parameters)), list[Product]()
     for sign, term in _terms(value):
-        number, name = _read_term(term, value, quantity, known, parameters)
-        if name is None:
+        named, amplitude = _amplitude(term, value, amplitudes)
+        number, name = _read_term(named, value, quantity, known, parameters)
+        index = None if name is None else known[name]
+        if amplitude:
+            products.append(Product(sign * number, index, amplitude, amplitudes.functions[amplitude], amplitudes.clock))
+        elif index is None:
             constant += sign * number
         else:
-            slopes[known[name]] += sign * number
-    return Affine(constant, tuple(slopes.tolist()))
+            slopes[index] += sign * number
+    return Affine(constant, tuple(slopes.tolist()), tuple(products))
+
+
+def _amplitude(term: re.Match, text: str, known: Amplitudes) -> tuple[Mapping[str, Any], str]:
+    """The parts of a term without its amplitude, and the amplitude's name; empty if it has none."""
+    parts, name = term.groupdict(), term["amplitude"]
+    for key in ("factor", "name"):
+        if name is None and parts[key] in known.functions:
+            name, parts[key] = parts[key], None
+    if name is None:
+        return parts, ""
+    if name not in known.functions:
+        listed = f"the amplitudes are {', '.join(known.functions)}" if known.functions else "the study has none"
+        raise StudyError(
+            f"'{text}' multiplies by '{name}', which is no amplitude of [time]; {listed}. Sums are linear: a term is a "
+            "number, or a number times a parameter"
+        )
+    return parts, name
 
 
 def usual_unit(quantity: str) -> str:
@@ -131,7 +210,7 @@ def _terms(text: str) -> list[tuple[float, re.Match]]:
 
 
 def _read_term(
-    term: re.Match, text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
+    term: Mapping[str, Any], text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
 ) -> tuple[float, str | None]:
     """Number (SI) and parameter's name, if any, of one term."""
     unit = term["unit"]
@@ -168,7 +247,7 @@ def _read_term(
 
 
 def _share(
-    term: re.Match, text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
+    term: Mapping[str, Any], text: str, quantity: str, known: Mapping[str, int], parameters: Sequence[Parameter]
 ) -> float:
     """One over the quantity that a parameter, which measures the same, is divided by."""
     divisor, name = possible(float(term["divisor"]), text), term["factor"] or term["name"]

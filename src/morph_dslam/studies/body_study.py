@@ -19,7 +19,7 @@ from morph_dslam.mechanics.supports import ElasticFoundation
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
-from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sections import JOINED
@@ -77,7 +77,9 @@ _CHECKED = (Material, ShellMaterial, RigidSphere, RigidCylinder, ElasticFoundati
 _MOST_COMBINED = 8
 
 
-def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter]) -> None:
+def read_once(
+    parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter], amplitudes: Amplitudes = NO_AMPLITUDES
+) -> None:
     """Read every value of sections with ``make``, so that a mistake is found before anything is solved.
 
     Materials, thicknesses, radii of obstacles and foundations are checked at the defaults of the parameters and at both
@@ -89,26 +91,28 @@ def read_once(parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter])
     for where, section in parts:
         used: set[int] = set()
         try:
-            made = _made(section, parameters, defaults, used)
+            made = _made(section, parameters, defaults, used, amplitudes)
         except StudyError as error:
-            blamed = _to_blame(section, parameters, used)
+            blamed = _to_blame(section, parameters, used, amplitudes)
             raise ValueError(f"{where}: {error}{_changed_range(parameters, blamed, defaults)}") from error
         if not isinstance(made, _CHECKED):
             continue
         elastic = isinstance(made, ShellMaterial) or (isinstance(made, Material) and made.prony is None)
         for at, mu in range_ends(parameters, sorted(used), combined=not elastic):
             try:
-                _made(section, parameters, mu, set())
+                _made(section, parameters, mu, set(), amplitudes)
             except StudyError as error:
                 raise ValueError(f"{where}: {error}{_changed_range(parameters, at, mu)}") from error
 
 
-def _made(section: Any, parameters: Sequence[Parameter], mu: Array, used: set[int]) -> Any:
+def _made(
+    section: Any, parameters: Sequence[Parameter], mu: Array, used: set[int], amplitudes: Amplitudes = NO_AMPLITUDES
+) -> Any:
     """What a section describes at ``mu`` (d,), checked; ``used`` takes the parameters that it depends on."""
 
     def read(value: Value, quantity: str | None) -> float:
-        found = read_affine(value, quantity, parameters)
-        used.update(np.flatnonzero(found.slopes).tolist())
+        found = read_affine(value, quantity, parameters, amplitudes)
+        used.update(found.used)
         return found(mu)
 
     made = section.make(read)
@@ -129,9 +133,13 @@ def range_ends(parameters: Sequence[Parameter], used: list[int], combined: bool)
             yield group, mu
 
 
-def _to_blame(section: Any, parameters: Sequence[Parameter], used: set[int]) -> list[int]:
+def _to_blame(section: Any, parameters: Sequence[Parameter], used: set[int], amplitudes: Amplitudes) -> list[int]:
     """Those parameters ``used`` whose default alone makes a section impossible: with another value it can be."""
-    return [k for k in sorted(used) if any(_can_be(section, parameters, k, value) for value in _others(parameters[k]))]
+
+    def can_be(k: int) -> bool:
+        return any(_can_be(section, parameters, k, value, amplitudes) for value in _others(parameters[k]))
+
+    return [k for k in sorted(used) if can_be(k)]
 
 
 def _others(parameter: Parameter) -> tuple[float, ...]:
@@ -140,11 +148,11 @@ def _others(parameter: Parameter) -> tuple[float, ...]:
     return upper, lower, (lower + upper) / 2.0, -lower, -upper
 
 
-def _can_be(section: Any, parameters: Sequence[Parameter], k: int, value: float) -> bool:
+def _can_be(section: Any, parameters: Sequence[Parameter], k: int, value: float, amplitudes: Amplitudes) -> bool:
     mu = np.array([p.default for p in parameters])
     mu[k] = value
     try:
-        _made(section, parameters, mu, set())
+        _made(section, parameters, mu, set(), amplitudes)
     except StudyError:
         return False
     return True
@@ -158,12 +166,20 @@ def _changed_range(parameters: Sequence[Parameter], at: list[int], mu: Array) ->
     return f" where {state}: change {'its range' if len(at) == 1 else 'their ranges'}"
 
 
+def amplitudes_of(symbols: ParameterSymbols) -> Amplitudes:
+    """Those of a study's symbols."""
+    names = [parameter.name for parameter in symbols.parameters]
+    return Amplitudes(names.index(symbols.clock), symbols.amplitudes) if symbols.amplitudes else NO_AMPLITUDES
+
+
 def reader_of(symbols: ParameterSymbols) -> Reader:
     """Reads a value of a study as an expression of the symbols."""
     values = [symbols[parameter.name] for parameter in symbols.parameters]
+    known = amplitudes_of(symbols)
+    functions = {name: symbols[name] for name in symbols.amplitudes}
 
     def read(value: Value, quantity: str | None) -> Any:
-        return read_affine(value, quantity, symbols.parameters).expression(values)
+        return read_affine(value, quantity, symbols.parameters, known).expression(values, functions)
 
     return read
 
@@ -183,13 +199,17 @@ class BodyStudy:
         """Sentences on what the study asks for that is probably not meant, or not served by its elements."""
         raise NotImplementedError
 
+    def amplitudes(self) -> Amplitudes:
+        """The functions of time that terms may be multiplied by; none."""
+        return NO_AMPLITUDES
+
     def check_parameters_used(self, elsewhere: Sequence[str] = ()) -> None:
         """Raise StudyError if a parameter changes nothing; those named ``elsewhere`` do."""
         parameters = self.model_parameters()
         defaults, used = self.root(), set(elsewhere)
         for _, section in self._parts():
             numbers: set[int] = set()
-            _made(section, parameters, defaults, numbers)
+            _made(section, parameters, defaults, numbers, self.amplitudes())
             used |= {parameters[k].name for k in numbers}
         if unused := [parameter.name for parameter in parameters if parameter.name not in used]:
             raise StudyError(

@@ -21,6 +21,7 @@ from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
 from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
 from morph_dslam.reduction.adaptive_sampling import estimator_check
+from morph_dslam.reduction.bisection import COARSER
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
 from morph_dslam.reduction.registry import ReductionMethod, reduction_method
 from morph_dslam.reduction.self_penetration import obstacle_report, penetration_report
@@ -213,9 +214,10 @@ def _unresolved(study: Study, snapshots: Snapshots) -> list[str]:
         worst = next((place for place in places if place["why"] == why), None)
         if worst is not None:
             where = _between(snapshots, worst["between"]) if "between" in worst else _at(snapshots, worst["at"])
-            error = f"an estimated error of up to {100.0 * worst['estimate']:.2g} %"
+            of = worst.get("of", "displacement")
+            error = f"an estimated error of the {of} of up to {100.0 * worst['estimate']:.2g} %"
             error = error if np.isfinite(worst["estimate"]) else "no solution of the reduced equations"
-            tolerance = f"{100.0 * study.reduction.tolerance:.2g} %"
+            tolerance = f"{100.0 * study.reduction.tolerance * (COARSER if of != 'displacement' else 1.0):.2g} %"
             count = study.sampling.training
             sentences.append(sentence.format(count=count, error=error, where=where, tolerance=tolerance, ranges=ranges))
     return sentences
@@ -239,7 +241,7 @@ def _jump(snapshots: Snapshots, place: dict[str, Any]) -> str:
     counted = f"of the {len(snapshots.held_out)} held-out solutions that measure the errors, {within or 'none'} "
     return (
         f"solutions jump {_between(snapshots, [low, high])}: there the model is off by up to "
-        f"{100.0 * place['estimate']:.2g} % of the largest displacement, and {counted}"
+        f"{100.0 * place['estimate']:.2g} % of the largest {place['of']}, and {counted}"
         f"{'lie' if within > 1 else 'lies'} there; build each side by itself"
     )
 

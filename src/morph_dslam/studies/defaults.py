@@ -20,6 +20,8 @@ from morph_dslam.studies.study import Study
 FEWEST = 4
 #: Solves that bisection starts with, and held-out ones beside it: with 95 % confidence they bound 82.9 % of the range.
 FIRST, HELD_OUT = 5, 16
+#: Paths in time for one other parameter, twice as many for each further one, and the most.
+PATHS, MOST_PATHS = 16, 128
 
 
 def resolve_defaults(study: Study) -> Study:
@@ -39,9 +41,10 @@ def resolve_defaults(study: Study) -> Study:
     if not isinstance(study, ExternalStudy):
         dimension = len(study.model_parameters())
         _check_functions(study.reduction, method, dimension)
-        sampling = _sampling(study.sampling, method, dimension, _why_no_equations(study) is None)
-        if isinstance(study, BodyStudy) and method.name == "pod" and sampling.scheme == "sobol":
-            _check_count(sampling.training, dimension, _has_slopes(study))
+        in_time = isinstance(study, SolidStudy) and study.time is not None
+        sampling = _sampling(study.sampling, method, dimension, _why_no_equations(study) is None, in_time)
+        if isinstance(study, BodyStudy) and method.name == "pod" and sampling.scheme in ("sobol", "paths"):
+            _check_count(sampling.training, dimension - (sampling.scheme == "paths"), _has_slopes(study))
         update["sampling"] = sampling
     return study.model_copy(update=update)
 
@@ -93,9 +96,17 @@ def _method(study: Study) -> ReductionMethod:
     return method
 
 
-def _sampling(sampling: SamplingSection, method: ReductionMethod, dimension: int, equations: bool) -> SamplingSection:
+def _sampling(
+    sampling: SamplingSection, method: ReductionMethod, dimension: int, equations: bool, in_time: bool
+) -> SamplingSection:
     bisects = method.bisects and dimension == 1
-    scheme = sampling.scheme or ("adaptive" if method.adaptive or bisects else "sobol")
+    follows = in_time and method.name == "pod" and dimension > 1
+    scheme = sampling.scheme or ("adaptive" if method.adaptive or bisects else "paths" if follows else "sobol")
+    if scheme == "paths" and not follows:
+        raise StudyError(
+            'sampling.scheme = "paths" is for studies with [time], other parameters besides it, and method = "pod": '
+            "leave it out"
+        )
     if scheme == "adaptive" and not (method.adaptive or bisects):
         raise StudyError(
             f'sampling.scheme = "adaptive" needs an estimate of the error, which method "{method.name}" '
@@ -104,10 +115,12 @@ def _sampling(sampling: SamplingSection, method: ReductionMethod, dimension: int
     defaults = {"first": sampling.first, "held_out": sampling.held_out}
     if bisects and scheme == "adaptive":
         defaults = {"first": FIRST, "held_out": HELD_OUT}
+    elif scheme == "paths":
+        defaults["training"] = min(PATHS * 2 ** (dimension - 2), MOST_PATHS)
     elif method.greedy:
         defaults["first"] = dimension + FEWEST  # each choice knows all before it
     chosen = {name: value for name, value in defaults.items() if name not in sampling.model_fields_set}
-    chosen["first"] = min(chosen.get("first", sampling.first), sampling.training)
+    chosen["first"] = min(chosen.get("first", sampling.first), chosen.get("training", sampling.training))
     return sampling.model_copy(update={"scheme": scheme, **chosen})
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from morph_dslam.errors import StudyError
+from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.model import Parameter
 from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.sections import Section, quantity
+from morph_dslam.studies.sections import Number, Section, quantity
 from morph_dslam.studies.solid_sections import Value
 from morph_dslam.units import quantity_of
 
@@ -59,14 +61,47 @@ def _unit(value: Value) -> str:
 
 
 Duration = Annotated[float, quantity("time"), Field(gt=0, allow_inf_nan=False)]
+Instant = Annotated[float, quantity("time"), Field(ge=0, allow_inf_nan=False)]
+
+
+class AmplitudeSection(Section):
+    """What terms of loads and motions are multiplied by as time runs.
+
+    ``values`` at ``times``, straight lines in between; before the first time and after the last it is constant.
+    """
+
+    times: tuple[Instant, ...] = Field(min_length=2)
+    values: tuple[Number, ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> AmplitudeSection:
+        if len(self.times) != len(self.values):
+            raise ValueError(f"{len(self.times)} times and {len(self.values)} values: give one value for each time")
+        if any(later <= earlier for earlier, later in pairwise(self.times)):
+            raise ValueError("times must rise from one to the next; a step takes a short time")
+        return self
+
+    def make(self) -> Amplitude:
+        """The function."""
+        return Amplitude(self.times, self.values)
 
 
 class TimeSection(Section):
     """The parameter that is the time; at the lower end of its range the body is loaded in an instant.
 
     ``step`` is the longest increment of time; ``rest`` how long before that what is applied first has acted.
+    ``amplitudes`` are functions of time that terms may be multiplied by.
     """
 
     parameter: str
     step: Duration
     rest: Duration | None = None
+    amplitudes: dict[str, AmplitudeSection] = Field(default_factory=dict)
+
+    @field_validator("amplitudes")
+    @classmethod
+    def _check_names(cls, amplitudes: dict[str, AmplitudeSection]) -> dict[str, AmplitudeSection]:
+        for name in amplitudes:
+            if not name.isidentifier():
+                raise ValueError(f"'{name}' is no name for an amplitude: use letters, digits and underscores")
+        return amplitudes

@@ -14,6 +14,8 @@ from scipy.stats import qmc
 from morph_dslam.errors import StudyError
 from morph_dslam.studies.body_study import BodyStudy
 from morph_dslam.studies.problem import ParametricStudy, bounds
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.time_sampling import time_instants
 
 Array = NDArray[np.float64]
 #: How far training samples are moved from uniform to the Chebyshev density (`sample_box`).
@@ -27,6 +29,8 @@ def training_samples(study: ParametricStudy) -> Array:
     sampling = study.sampling
     if sampling.scheme == "even":
         return even_samples(study, sampling.training)
+    if sampling.scheme == "paths":
+        return path_samples(study)
     if sampling.scheme == "grid":
         axes = grid_axes(study)  # the last parameter runs fastest
         return study.admissible(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
@@ -76,6 +80,28 @@ def even_samples(study: ParametricStudy, count: int) -> Array:
             f'sampling.scheme = "even" is for one parameter, and this study has {len(box)}: use "grid" or "sobol"'
         )
     return study.admissible(np.linspace(box[0, 0], box[0, 1], count)[:, None])
+
+
+def first_samples(study: ParametricStudy) -> Array:
+    """Samples (n, 1) of a single parameter, both ends included, that bisection starts with."""
+    if isinstance(study, SolidStudy) and study.time is not None:
+        return study.admissible(time_instants(study)[:, None])
+    return even_samples(study, study.sampling.first)
+
+
+def path_samples(study: ParametricStudy) -> Array:
+    """The same instants of time (n_paths * n_instants, d) for the defaults, and for scattered other parameters.
+
+    One path in time has a solution at each of its instants, whatever their number.
+    """
+    if not isinstance(study, SolidStudy) or study.time is None:
+        raise StudyError('sampling.scheme = "paths" is for studies with [time]: use "adaptive" or "sobol"')
+    clock, instants = list(study.parameters).index(study.time.parameter), time_instants(study)
+    scattered = sample_box(study, study.sampling.training - 1, study.sampling.seed, TRAINING_TOWARDS_EDGES)
+    starts = np.vstack([study.root(), scattered])
+    samples = np.repeat(starts, len(instants), axis=0)
+    samples[:, clock] = np.tile(instants, len(starts))
+    return study.admissible(samples)
 
 
 def grid_axes(study: ParametricStudy) -> list[Array]:

@@ -110,14 +110,14 @@ class SamplingSection(Section):
     the box; "even" spaces them evenly with both ends included, for a single parameter; "grid" takes all
     points of a full grid with ``points`` for each parameter, or one number for all; "adaptive" solves
     ``first`` and then adds where the model's error is estimated to be largest, or, of a single parameter, in the
-    middle of intervals, up to ``training``. The method of reduction chooses where it is absent. Held-out samples
-    are always scattered.
+    middle of intervals, up to ``training``; "paths", of a study with a time, solves ``training`` paths at the same
+    instants. The method of reduction chooses where it is absent. Held-out samples are always scattered.
     ``refined`` of them are solved again with finer elements to estimate the discretisation error; 0 for none.
     """
 
     training: int = Field(default=256, ge=8, le=MOST_SAMPLES)
     held_out: int = Field(default=59, ge=4, le=MOST_SAMPLES)
-    scheme: Literal["sobol", "even", "grid", "adaptive"] | None = None
+    scheme: Literal["sobol", "even", "grid", "adaptive", "paths"] | None = None
     points: int | tuple[int, ...] | None = None
     first: int = Field(default=16, ge=4)
     seed: int = Field(default=0, ge=0)

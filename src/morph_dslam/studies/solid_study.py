@@ -21,7 +21,7 @@ from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.supports import held_still
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
-from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
 from morph_dslam.studies.body_study import (
     BodyStudy,
     NamedSet,
@@ -59,11 +59,14 @@ from morph_dslam.studies.solid_sections import (
 )
 from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep, loadable
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: `SolidOptions.mixed` by the name of a formulation.
 MIXED = {"automatic": None, "displacement": False, "mixed": True}
 #: More increments of time than these in a solve are a mistake in the unit of a step.
 MOST_INCREMENTS = 100_000
+#: So many times farther than other parameters the time is run through: from one moment of a path to the next.
+SAME_PATH = 1e6
 #: Kinds of supports, loads, contacts and shapes that name a surface, and those that name cells; others name nodes.
 _ON_SURFACES = (
     "foundation", "traction", "force", "pressure", "moving_patch", "moving_line", "thickness",
@@ -112,7 +115,8 @@ class SolidStudy(BodyStudy, Section):
     def _check_values(self) -> SolidStudy:
         """Read every value once, so that a mistake is found before anything is solved."""
         parameters = self.model_parameters()
-        read_once(self._parts(), parameters)
+        self._check_amplitudes()
+        read_once(self._parts(), parameters, self.amplitudes())
         if len({material.on for material in self.materials.values()}) < len(self.materials):
             raise ValueError("two materials are on the same cell set: give each its own")
         self._check_time(parameters)
@@ -122,6 +126,27 @@ class SolidStudy(BodyStudy, Section):
         if self.unknown_loads and self.time:
             raise ValueError("[unknown_loads] is for elastic solids, not for viscoelastic ones: leave it out")
         return self
+
+    def amplitudes(self) -> Amplitudes:
+        """See `BodyStudy`."""
+        if self.time is None or not self.time.amplitudes:
+            return NO_AMPLITUDES
+        clock = list(self.parameters).index(self.time.parameter)
+        return Amplitudes(clock, {name: section.make() for name, section in self.time.amplitudes.items()})
+
+    def _check_amplitudes(self) -> None:
+        """They follow the time, and are no parameters."""
+        if self.time is None or not self.time.amplitudes:
+            return
+        if self.time.parameter not in self.parameters:
+            raise ValueError(f"time.parameter: '{self.time.parameter}' is no parameter that measures time")
+        if twice := self.parameters.keys() & self.time.amplitudes.keys():
+            raise ValueError(f"time.amplitudes: '{min(twice)}' is a parameter too: give the amplitude another name")
+
+    def _symbols(self) -> ParameterSymbols:
+        """The parameters and amplitudes as the mechanics takes them."""
+        clock = self.time.parameter if self.time else ""
+        return ParameterSymbols(self.model_parameters(), clock, self.amplitudes().functions)
 
     def _check_weight(self) -> None:
         """Gravity acts on densities; one that was forgotten would be a load that is not there."""
@@ -173,7 +198,7 @@ class SolidStudy(BodyStudy, Section):
             raise ValueError("time.rest: nothing rests; say of a load or support that it is first = true")
 
         def read(value: Value, quantity: str | None) -> float:
-            if read_affine(value, quantity, parameters).slopes[clock]:
+            if clock in read_affine(value, quantity, parameters, self.amplitudes()).used:
                 raise ValueError(f"'{value}' names the time, but rests before the time begins: leave out first = true")
             return 0.0
 
@@ -243,7 +268,7 @@ class SolidStudy(BodyStudy, Section):
         content["elements"] = self.solver.order, self.solver.formulation
         content["parameters"] = list(self.parameters)
         content["root"] = self.root().tolist() if self.time else None
-        content["time"] = self.time.model_dump(exclude_none=True) if self.time else None
+        content["time"] = self.time.model_dump(exclude_none=True, exclude_defaults=True) if self.time else None
         # Earlier versions kept solutions that remembered the defaults of Prony series and of rests.
         content |= {"memory": "of its own parameters"} if self.time else {}
         mesh = self.solid_mesh()
@@ -279,12 +304,19 @@ class SolidStudy(BodyStudy, Section):
             surfaces=kept(mesh.surfaces, {*own.surfaces} - own.found),
         )
 
+    def scale(self) -> Array:
+        """See `BodyStudy`; moments of one path in time are nearer to each other than to those of any other."""
+        scale = super().scale()
+        if self.time is not None:
+            scale[list(self.parameters).index(self.time.parameter)] *= SAME_PATH
+        return scale
+
     def problem(self, options: SolidOptions | None = None) -> SolidProblem:
         """The discretised solid, with the study's own elements if ``options`` name no others."""
         parameters, mesh = self.model_parameters(), self.solid_mesh()
         check_widths(self.loads, mesh)
         check_reach(self.loads, mesh, parameters)
-        symbols = ParameterSymbols(parameters)
+        symbols = self._symbols()
         reader = reader_of(symbols)
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
         materials = {section.on: section.make(reader) for section in self.materials.values()}
@@ -313,7 +345,7 @@ class SolidStudy(BodyStudy, Section):
 
     def obstacles(self) -> tuple[ParameterSymbols, list[tuple[RigidObstacle, Indices]]]:
         """What its contacts keep the solid out of, with the nodes that they name, and the symbols of its place."""
-        symbols, mesh = ParameterSymbols(self.model_parameters()), self.solid_mesh()
+        symbols, mesh = self._symbols(), self.solid_mesh()
         rigid = [section.make(reader_of(symbols)) for section in self.contacts if section.kind != "surface"]
         return symbols, [(body, mesh.set_nodes(body.on)) for body in rigid]
 

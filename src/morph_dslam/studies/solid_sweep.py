@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -458,11 +459,20 @@ class ViscousSweep:
         self.problem.history.restore(start.memory)
         state = State(start.mu, start.dofs)
         begin, end = start.mu[self._clock], target[self._clock]
-        count = int(np.ceil((end - begin) / self._step - 1e-9))
-        if count:
-            moments = [self._at_time(target, time) for time in np.linspace(begin, end, count + 1)[1:]]
-            state = follow(self.problem, state, np.array(moments))
+        times = self._times(begin, end)
+        if len(times):
+            state = follow(self.problem, state, np.array([self._at_time(target, time) for time in times]))
         return self._with_memory(State(target, state.dofs))
+
+    def _times(self, begin: float, end: float) -> Array:
+        """Ends of the increments of time from ``begin`` to ``end``, s; amplitudes have their corners at some."""
+        corners = {t for amplitude in self.problem.symbols.amplitudes.values() for t in amplitude.times}
+        ends = np.array([begin, *sorted(t for t in corners if begin < t < end), end])
+        parts = []
+        for first, last in pairwise(ends):
+            count = int(np.ceil((last - first) / self._step - 1e-9))
+            parts.append(np.linspace(first, last, count + 1)[1:])
+        return np.concatenate(parts)
 
     def _at_time(self, mu: Array, time: float) -> Array:
         moment = mu.copy()
