@@ -54,7 +54,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration-aids", "csv"): 1,
         ("shell-study", "toml"): 2,
         ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 10,
+        ("solid-study", "toml"): 11,
         ("study-file", "toml"): 1,
     }
 
@@ -277,6 +277,25 @@ def test_a_ball_that_presses_on_a_block():
     below = problem.mesh.nodes + problem.nodal_displacement(state.dofs)
     # The ball's lowest point was 4 mm below the top, where the node under it has gone.
     assert np.linalg.norm(below - [0.04, 0.06, 0.041], axis=1).min() == pytest.approx(0.015, abs=5e-4)
+
+
+def test_a_stroke_that_grows_stays_and_goes_back():
+    section = tomllib.loads(samples("solid-study", "toml")[8])
+    gel = {"law": "neo_hookean", "young": "1 MPa", "poisson": 0.3}
+    parameters = {"time": {"range": ["0 s", "20 s"]}, "stroke": {"range": ["0 mm", "8 mm"]}}
+    study = {
+        "name": "bar",
+        "mesh": {"generator": "block", "size": ["10 mm", "10 mm", "20 mm"], "divisions": [1, 1, 1], "cells": "hex8"},
+        "materials": {"gel": gel | {"prony": {"relative_moduli": [0.6], "times": ["2 s"]}}},
+        "parameters": parameters,
+    }
+    held = [{"kind": "fixed", "on": "z_min"}, *section.pop("supports")]
+    made = make_study(study | section | {"supports": held})
+    assert isinstance(made, SolidStudy)
+    symbols = made.problem().symbols
+    for time, share in ((1.0, 0.5), (5.0, 1.0), (12.5, 0.75), (20.0, 0.5)):
+        symbols.set(np.array([time, 8e-3]))
+        assert symbols.value(symbols["stroke"] * symbols["ramp"]) == pytest.approx(share * 8e-3)
 
 
 def test_shape_of_a_solid():

@@ -171,7 +171,7 @@ def prepared(study: Study) -> None:
             "sets.far: nearest is 800 mm away from the mesh, which is 100 mm long: give a point near it",
         ),
         (
-            SOLID | clock("0 s", "10 s") | {"sampling": {"training": 9}},
+            SOLID | clock("0 s", "10 s") | {"sampling": {"scheme": "sobol", "training": 9}},
             "sampling.training: 9 samples are too few for 2 parameters: give 10 at least",
         ),
         (
