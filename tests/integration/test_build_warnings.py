@@ -99,7 +99,9 @@ def test_samples_that_do_not_reach_the_tolerance_are_said_to(tmp_path: Path) -> 
         "reduction": {"method": "galerkin", "tolerance": 1e-6},
     }
     (said,) = md.build(md.make_study(study)).certificate["warnings"]
-    assert said.startswith("sampling ended at sampling.training = 8 solutions with an estimated error of up to ")
+    assert said.startswith(
+        "sampling ended at sampling.training = 8 solutions with an estimated error of the displacement of up to "
+    )
     assert said.endswith("where the tolerance is 0.0001 %: allow more, or narrow the ranges of the parameters")
     place = re.search(r"at pull = ([-\d.]+) kPa, push = ([-\d.]+) kPa", said)
     assert place is not None

@@ -15,7 +15,7 @@ from morph_dslam.cli import app as cli
 from morph_dslam.errors import StudyError
 from morph_dslam.model import ReducedModel
 from morph_dslam.studies.solid_study import SolidStudy
-from morph_dslam.studies.solid_sweep import ViscousSweep
+from morph_dslam.studies.viscous_sweep import ViscousSweep
 from tests.support.block_study import sliding
 from tests.support.closed_form_stress import lame
 
@@ -99,7 +99,7 @@ def test_a_stroke_that_grows_and_stays_is_tracked_by_forces_over_paths(tmp_path:
         "supports": pulled,
         "parameters": {"held": VARIED["parameters"]["held"], "load": VARIED["parameters"]["load"]},
         "sampling": {"training": 8, "held_out": 4},
-        "reduction": {"tolerance": 4e-3},
+        "reduction": {"tolerance": 1e-2},
     }
     model = md.build(make_study(content))
     assert model.certificate["reduction"]["paths"] == 8
@@ -116,7 +116,45 @@ def test_a_stroke_that_grows_and_stays_is_tracked_by_forces_over_paths(tmp_path:
             model.at({"held": t, "load": load}).reactions()["force_z_max"][2] for t in (1.0, 2.0, 2.3, 5, 12.5, 13, 17)
         ]
         wanted = np.interp([1.0, 2.0, 2.3, 5.0, 12.5, 13.0, 17.0], times, force)
-        np.testing.assert_allclose(found, wanted, atol=6e-3 * np.abs(force).max())
+        np.testing.assert_allclose(found, wanted, atol=1.3e-2 * np.abs(force).max())
+
+
+def test_an_increment_that_is_too_long_shows_in_the_discretisation_error() -> None:
+    """Creep under a stress s, small: the strain is s / E (1 + g / (1 - g) (1 - exp(-(1 - g) t / tau)))."""
+    gel = {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.0}
+    content = VARIED | {
+        "materials": {"gel": gel | {"prony": {"relative_moduli": [0.6], "times": ["0.2 s"]}}},
+        "time": {"parameter": "held", "step": "20 s"},
+        "supports": SIDES,
+        "loads": [{"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "30 Pa"]}],
+        "parameters": {"held": {"range": ["0 s", "2 s"]}},
+        "reduction": {"tolerance": 2e-2},
+    }
+    model = md.build(make_study(content))
+    entry = model.certificate["discretisation"]
+    assert entry["method"] == "displacements of order 2 on the same cells, half the increments of time"
+    errors = []
+    for (held,) in entry["coordinates"]:
+        truth = 30.0 / 3e6 * (1.0 + 1.5 * (1.0 - np.exp(-2.0 * held)))
+        errors.append(1e3 * (model.at({"held": held}).displacement()[:, 2] - truth * model.nodes[:, 2]))
+    stated = entry["errors"]["displacement"]["max_mm"]
+    assert 0.5 < stated / np.abs(errors).max() < 1.5
+    assert stated > 2e-4 * entry["errors"]["displacement"]["largest_mm"], "the increments are long indeed"
+
+
+def test_a_state_does_not_depend_on_the_samples_before_it() -> None:
+    weight = [{"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "300 kPa"]}]
+    sweep = varied({"relative_moduli": ["g"], "times": ["tau"]}, 0.3, "20 s", supports=SIDES, loads=weight)
+
+    def at(held: float) -> np.ndarray:
+        return np.array([held, 0.4, 0.0, 1.0, 1e6, 0.0])
+
+    alone = sweep.advance(sweep.first_state(), at(17.3))
+    state = sweep.first_state()
+    for held in (0.01, 3.3, 9.0, 9.1, 16.9, 17.3):
+        state = sweep.unpack(sweep.pack(sweep.advance(state, at(held))))
+    found, wanted = (sweep.take_snapshot(one).fields["displacement"] for one in (state, alone))
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())
 
 
 #: The same bar with what may change from sample to sample: at t = 0 none of it is any default's.

@@ -73,14 +73,14 @@ def test_splines_through_the_instants_take_relaxation_and_ramps(span: float) -> 
 
 def test_paths_share_their_instants_and_begin_with_the_defaults() -> None:
     study = bar()
-    assert (study.sampling.scheme, study.sampling.training) == ("paths", 16)
+    assert (study.sampling.scheme, study.sampling.training) == ("paths", 24)
     samples, instants = training_samples(study), time_instants(study)
-    assert len(samples) == 16 * len(instants)
+    assert len(samples) == 24 * len(instants)
     np.testing.assert_allclose(samples[: len(instants), 1], instants)
     assert not samples[: len(instants), 0].any(), "the first path has the default pull"
     paths = TimePaths.of(samples, study.model_parameters())
     assert paths is not None
-    assert paths.rows.shape == (16, len(instants))
+    assert paths.rows.shape == (24, len(instants))
 
 
 def test_what_is_a_polynomial_at_each_instant_is_met_exactly() -> None:

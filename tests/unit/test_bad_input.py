@@ -270,7 +270,7 @@ def message_of_study(folder, *changes):
         ),
         (
             ("training = 24", 'scheme = "grids"'),
-            "sampling.scheme: 'grids' must be 'sobol', 'even', 'grid' or 'adaptive'",
+            "sampling.scheme: 'grids' must be 'sobol', 'even', 'grid', 'adaptive' or 'paths'",
         ),
         (("training = 24", 'points = "x"'), "sampling.points: 'x' must be a whole number or a list"),
         (("training = 24", "points = [2, 1.5]"), "sampling.points, entry 2: 1.5 must be a whole number"),

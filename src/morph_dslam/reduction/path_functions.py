@@ -43,11 +43,17 @@ class TimePaths:
 
     @staticmethod
     def of(samples: Array, parameters: Sequence[Parameter]) -> TimePaths | None:
-        """The paths among samples (n, d), whole ones alone; None if most samples are on none, or no time is varied."""
-        clocks = [k for k, parameter in enumerate(parameters) if parameter.quantity == "time"]
-        if len(clocks) != 1 or len(parameters) < 2:
-            return None
-        (clock,) = clocks
+        """The paths among samples (n, d), whole ones alone; None if most samples are on none, or no time is varied.
+
+        Where several parameters measure time, as relaxation times do, the clock is the one that paths run along.
+        """
+        clocks = [k for k, parameter in enumerate(parameters) if parameter.quantity == "time"] * (len(parameters) > 1)
+        found = (TimePaths._along(clock, samples, parameters[clock]) for clock in clocks)
+        return next((paths for paths in found if paths is not None), None)
+
+    @staticmethod
+    def _along(clock: int, samples: Array, parameter: Parameter) -> TimePaths | None:
+        """The paths along one parameter."""
         times, others = samples[:, clock], np.delete(samples, clock, axis=1)
         instants = np.unique(times)
         _, path = np.unique(others, axis=0, return_inverse=True)
@@ -55,7 +61,7 @@ class TimePaths:
         rows = np.full((path.max() + 1, len(instants)), -1)
         rows[path, np.searchsorted(instants, times)] = np.arange(len(samples))
         whole = rows[(rows >= 0).all(axis=1)]
-        ends = [parameters[clock].lower, parameters[clock].upper]
+        ends = [parameter.lower, parameter.upper]
         covers = np.allclose(instants[[0, -1]], ends, rtol=0.0, atol=1e-9 * (ends[1] - ends[0]))
         if len(instants) < LEAST or not covers or whole.size < MOSTLY * len(samples):
             return None

@@ -38,6 +38,7 @@ from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
 from morph_dslam.studies.study import Study, load_study, study_file, study_mesh_deviation, study_mesh_notes
+from morph_dslam.studies.time_sampling import time_instants
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 
 #: Fewer held-out solutions than these say nothing of the error.
@@ -130,7 +131,10 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         mesh_notes = _announce_mesh(chosen)
     _announce_doubts(chosen)
     if not isinstance(chosen, ExternalStudy) and chosen.sampling.scheme == "adaptive":
-        most = f"sampling: at most {chosen.sampling.training} solves, {chosen.sampling.first} of them first and more "
+        first = chosen.sampling.first
+        if isinstance(chosen, SolidStudy) and chosen.time is not None:
+            first = len(time_instants(chosen))
+        most = f"sampling: at most {chosen.sampling.training} solves, {first} of them first and more "
         announce(f"{most}where the error is large; then {chosen.sampling.held_out} held-out ones")
     snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
     _check_held_out(chosen, snapshots, output)

@@ -20,8 +20,8 @@ from morph_dslam.studies.study import Study
 FEWEST = 4
 #: Solves that bisection starts with, and held-out ones beside it: with 95 % confidence they bound 82.9 % of the range.
 FIRST, HELD_OUT = 5, 16
-#: Paths in time for one other parameter, twice as many for each further one, and the most.
-PATHS, MOST_PATHS = 16, 128
+#: Paths in time for one other parameter and for two; for more, as many as scattered samples.
+PATHS = {1: 24, 2: 128}
 
 
 def resolve_defaults(study: Study) -> Study:
@@ -116,7 +116,7 @@ def _sampling(
     if bisects and scheme == "adaptive":
         defaults = {"first": FIRST, "held_out": HELD_OUT}
     elif scheme == "paths":
-        defaults["training"] = min(PATHS * 2 ** (dimension - 2), MOST_PATHS)
+        defaults["training"] = PATHS.get(dimension - 1, sampling.training)
     elif method.greedy:
         defaults["first"] = dimension + FEWEST  # each choice knows all before it
     chosen = {name: value for name, value in defaults.items() if name not in sampling.model_fields_set}

@@ -1,5 +1,7 @@
 """The discretisation error of a study's solutions: a few held-out ones are solved again with elements one order higher.
 
+Viscous solids are followed again from the beginning, with half the increments of time besides.
+
 States are chosen by their strain alone, before anything is solved. How many can be afforded, in a quarter of the
 build's time or 20 seconds, follows from numbers of unknowns, so that it is the same in every run; the clock ends what
 takes longer than foreseen, and the certificate says what was left out and why.
@@ -40,6 +42,7 @@ from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solid_sweep import SolidSweep, solid_snapshot
 from morph_dslam.studies.solutions import Snapshots
 from morph_dslam.studies.study import Study
+from morph_dslam.studies.viscous_sweep import ViscousSweep
 
 Array = NDArray[np.float64]
 #: Part of the whole build that the estimate may take, and seconds that it may take of any build: short ones consist of
@@ -63,6 +66,8 @@ BYTES_OF_A_MILLION = 45e9
 ITERATIVE_TANGENTS, ITERATIVE_BYTES = 6.0, 12e3
 #: Contact's stiffness in the finer solutions over the study's.
 STIFFER = 10.0
+#: So many times along a path in time the clock is looked at.
+PAUSES = 40
 #: Highest order of a shell's displacements.
 FINEST_SHELL = 3
 #: Fields that follow from derivatives of the displacement, and part of the nodes that must have them for an estimate.
@@ -119,8 +124,6 @@ def _refinable(study: Study) -> SolidStudy | ShellStudy:
         if study.solver.order >= FINEST_SHELL:
             raise _NotEstimated(f"shells of order {study.solver.order} have no finer elements to compare with")
         return study
-    if study.time is not None:
-        raise _NotEstimated("a viscoelastic solid would have to be followed from the beginning with finer elements")
     return study
 
 
@@ -141,6 +144,9 @@ def _estimate(
     assert snapshots.problem is not None
     begin = time.monotonic()
     sweep = snapshots.problem()
+    if isinstance(sweep, ViscousSweep):
+        assert isinstance(study, SolidStudy)
+        return _estimate_in_time(study, snapshots, model, sweep, seconds)
     assert isinstance(sweep, SolidSweep)
     solves = len(snapshots.training) + len(snapshots.held_out)
     finer = HigherOrder(sweep.problem, _finer(study, sweep.problem))
@@ -157,7 +163,7 @@ def _estimate(
         try:
             found = finer.solve(state["dofs"], state["mu"], lambda: time.monotonic() < end)
             _check_same_branch(finer.problem, found, pivots)
-            solved[index] = found
+            solved[index] = _snapshot(finer.problem, found)
         except OutOfTime:
             left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
             break
@@ -165,9 +171,68 @@ def _estimate(
             left_out = f"one was left out: {error}"
     if not solved:
         raise _NotEstimated(left_out)
-    return _figures(model, snapshots, sweep.problem, finer.problem, solved) | (
-        {"left_out": left_out} if left_out else {}
-    )
+    figures = _figures(model, snapshots, sweep.problem, finer.problem, solved)
+    return figures | ({"left_out": left_out} if left_out else {})
+
+
+def _estimate_in_time(
+    study: SolidStudy, snapshots: Snapshots, model: ReducedModel, sweep: ViscousSweep, seconds: float
+) -> dict[str, Any]:
+    """The same of a viscous solid, whose states are followed from the beginning."""
+    begin, finer = time.monotonic(), _finer(study, sweep.problem)
+    unknowns = _unknowns(sweep.problem, finer)
+    chosen = chosen_states(snapshots.held_out, study.sampling.refined)[: _affordable_paths(study, snapshots, unknowns)]
+    end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * seconds, FLOOR)
+    announce(f"following {len(chosen)} held-out states again with finer elements and half the increments of time")
+    halved, solved, left_out = sweep.finer_in_time(finer), {}, ""
+    for index in chosen:
+        try:
+            solved[index] = _followed(halved, snapshots.held_out[index].coordinates, lambda: time.monotonic() < end)
+        except OutOfTime:
+            left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
+            break
+        except SolverError as error:
+            left_out = f"one was left out: {error}"
+    if not solved:
+        raise _NotEstimated(left_out)
+    figures = _figures(model, snapshots, sweep.problem, finer, solved)
+    figures["method"] += ", half the increments of time"
+    return figures | ({"left_out": left_out} if left_out else {})
+
+
+def _followed(sweep: ViscousSweep, mu: Array, in_time: Callable[[], bool]) -> Snapshot:
+    """The snapshot of a viscous solid at ``mu`` (d,); OutOfTime when ``in_time`` says no, asked along the path."""
+    state = sweep.first_state()
+    for moment in sweep.moments(mu, PAUSES):
+        if not in_time():
+            raise OutOfTime
+        state = sweep.advance(state, moment)
+    return sweep.take_snapshot(state)
+
+
+def _affordable_paths(study: SolidStudy, snapshots: Snapshots, unknowns: list[int]) -> int:
+    """How many paths in time, with finer elements and half the increments, a quarter of the build affords.
+
+    Raises _NotEstimated where memory or time allow none.
+    """
+    assert study.time is not None
+    own, finer = unknowns
+    if _direct_bytes(finer) > MOST_BYTES:
+        raise _NotEstimated(f"{finer} unknowns of finer elements would need about {1e-9 * _direct_bytes(finer):.0f} GB")
+    clock = next(p for p in study.model_parameters() if p.name == study.time.parameter)
+    solved = [group[0].coordinates for group in snapshots.training] + [s.coordinates for s in snapshots.held_out]
+    others = np.delete(np.array(solved), list(study.parameters).index(clock.name), axis=1)
+    paths = len(np.unique(others, axis=0))
+    ratio = 2.0 * (finer / own) ** TIME_POWER
+    increments = (clock.upper - clock.lower) / study.time.step
+    of_one = ratio * SWEEP_TANGENTS * increments * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
+    count = int(max(SHARE / (1.0 - SHARE) * paths / ratio, FLOOR / of_one))
+    if count < 1:
+        raise _NotEstimated(
+            f"one path with {finer} unknowns of finer elements would take as long as {ratio:.0f} of the build's "
+            f"{paths} paths, more than {_LIMIT}"
+        )
+    return count
 
 
 def _check_same_branch(problem: SolidProblem, found: State, pivots: int) -> None:
@@ -356,13 +421,13 @@ def _snapshot(problem: SolidProblem, state: State) -> Snapshot:
 
 
 def _figures(
-    model: ReducedModel, snapshots: Snapshots, coarse: SolidProblem, finer: SolidProblem, solved: dict[int, State]
+    model: ReducedModel, snapshots: Snapshots, coarse: SolidProblem, finer: SolidProblem, solved: dict[int, Snapshot]
 ) -> dict[str, Any]:
     """Errors of the held-out solutions against the finer ones, field by field."""
     reactions = [name.removeprefix(REACTION) for name in model.fields if name.startswith(REACTION)]
     pairs = [
-        (snapshots.held_out[index], with_reactions(_snapshot(finer, state), reactions))
-        for index, state in sorted(solved.items())
+        (snapshots.held_out[index], with_reactions(finer_snapshot, reactions))
+        for index, finer_snapshot in sorted(solved.items())
     ]
     shapes = [(own.coordinates, own.fields["displacement"], truth.fields["displacement"]) for own, truth in pairs]
     known = [_regular_nodes(truth) for _, truth in pairs]

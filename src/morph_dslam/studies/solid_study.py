@@ -57,7 +57,9 @@ from morph_dslam.studies.solid_sections import (
     make_mesh,
     mesh_fingerprint,
 )
-from morph_dslam.studies.solid_sweep import SolidSweep, ViscousSweep, loadable
+from morph_dslam.studies.solid_sweep import SolidSweep, loadable
+from morph_dslam.studies.time_sampling import time_increments
+from morph_dslam.studies.viscous_sweep import ViscousSweep
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -269,8 +271,9 @@ class SolidStudy(BodyStudy, Section):
         content["parameters"] = list(self.parameters)
         content["root"] = self.root().tolist() if self.time else None
         content["time"] = self.time.model_dump(exclude_none=True, exclude_defaults=True) if self.time else None
-        # Earlier versions kept solutions that remembered the defaults of Prony series and of rests.
-        content |= {"memory": "of its own parameters"} if self.time else {}
+        # Earlier versions kept solutions that remembered the defaults of Prony series and of rests, or were followed in
+        # even increments.
+        content |= {"memory": "of its own parameters", "increments": "as a linear body answers"} if self.time else {}
         mesh = self.solid_mesh()
         content["mesh"] = mesh_fingerprint(self._solved(mesh))
         content["code"] = SOLVER_VERSION
@@ -358,7 +361,7 @@ class SolidStudy(BodyStudy, Section):
         if self.time is None:
             return loadable(SolidSweep(self.problem()), self.unknown_loads)
         clock = list(self.parameters).index(self.time.parameter)
-        return ViscousSweep(self.problem(), clock, self.time.step, self.time.rest or 0.0)
+        return ViscousSweep(self.problem(), clock, time_increments(self), self.time.rest or 0.0)
 
     def doubts(self) -> list[str]:
         """See `BodyStudy`: sets that cover little of their ball, loads that fall beside their surface."""

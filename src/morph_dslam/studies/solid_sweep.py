@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -30,8 +28,6 @@ from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sections import UnknownLoadsSection
 
 Array = NDArray[np.float64]
-#: Each increment of time of a rest is so many times the one before.
-GROWTH = 1.2
 #: Second derivatives are differences of steps that move no node by more than this part of the body's extent.
 SECOND_STEP = 2e-3
 #: So many times the smallest increment of a path is made in smaller ones, to say how far a body can be followed.
@@ -336,151 +332,3 @@ def loadable(sweep: Loadable, section: UnknownLoadsSection | None) -> Loadable:
                 "surface"
             )
     return sweep
-
-
-def _forget(problem: SolidProblem, time: float) -> None:
-    """Let viscous materials remember a body that has rested for ever, at this time (s)."""
-    assert problem.history is not None
-    memory = np.zeros_like(problem.history.values())
-    memory[-1] = time
-    problem.history.restore(memory)
-
-
-def _moved_at_once(problem: SolidProblem, start: State, mu: Array) -> State:
-    """The state that loading in an instant leads to at ``mu`` (d,), found from ``start`` and remembered.
-
-    Nothing is remembered of the way: a Prony series that changes along it would leave stress that no loading does.
-    """
-    state = start if np.array_equal(start.mu, mu) else follow(problem, start, mu, remember=False)
-    problem.advance_history(state.dofs, mu)
-    return state
-
-
-@dataclass(frozen=True)
-class _ViscousSolution:
-    """A solution and what the materials remember.
-
-    Attributes
-    ----------
-    mu : (d,).
-    dofs : (n,).
-    memory : (h,) internal variables.
-    """
-
-    mu: Array
-    dofs: Array
-    memory: Array
-
-
-class ViscousSweep:
-    """Solves a viscoelastic solid (`morph_dslam.studies.problem.SweepProblem`).
-
-    All parameters but the time keep their values from the beginning on, that of a rest too: the body is loaded in an
-    instant, and then time runs. The way from one such instant to that of other parameters leaves no memory. What is
-    remembered depends on the whole path, so derivatives by the parameters at a fixed memory would be wrong ones;
-    snapshots carry none, and the functions of the parameters are fitted to values.
-
-    Parameters
-    ----------
-    problem : at rest; its clock stands at the default of the time.
-    clock : index of the parameter that is the time.
-    step : longest increment of time, s.
-    rest : how long what is applied first has acted when all else comes, s.
-    """
-
-    def __init__(self, problem: SolidProblem, clock: int, step: float, rest: float = 0.0) -> None:
-        self.problem, self._clock, self._step, self._rest = problem, clock, step, rest
-
-    @cached_property
-    def _first(self) -> SolidProblem | None:
-        """What is applied first, where it rests."""
-        return self.problem.applied_first() if self.problem.applied_first is not None and self._rest else None
-
-    def _rested(self, mu: Array) -> Array | None:
-        """Dofs (n,) of what is applied first, after its rest, whose memory the problem takes; None without a rest."""
-        first, history = self._first, self.problem.history
-        if first is None:
-            return None
-        assert history is not None
-        assert first.history is not None
-        # Increments grow with the age of the load, as relaxation slows down.
-        count = int(np.ceil(np.log1p((GROWTH - 1.0) * self._rest / self._step) / np.log(GROWTH)))
-        ages = self._rest * (GROWTH ** np.arange(count + 1) - 1.0) / (GROWTH**count - 1.0)
-        moments = [self._at_time(mu, mu[self._clock] - self._rest + age) for age in ages]
-        begin = self._at_time(self.problem.symbols.default, moments[0][self._clock])
-        _forget(first, begin[self._clock])
-        state = _moved_at_once(first, loaded_state(first, begin), moments[0])
-        state = follow(first, state, np.array(moments[1:]))
-        history.restore(first.history.values())
-        return state.dofs
-
-    @cached_property
-    def _loaded(self) -> State:
-        """The default state, an instant after loading; what rests has not rested."""
-        _forget(self.problem, self.problem.symbols.default[self._clock])
-        return loaded_state(self.problem, self.problem.symbols.default)
-
-    def _loaded_at(self, mu: Array) -> _ViscousSolution:
-        """The state at ``mu`` (d,) an instant after loading, whose memory is that of these parameters alone."""
-        rested = self._rested(mu)
-        if rested is None:
-            start = self._loaded
-            _forget(self.problem, mu[self._clock])
-            state = _moved_at_once(self.problem, start, mu)
-        else:
-            state = loaded_state(self.problem, mu, rested)
-            self.problem.advance_history(state.dofs, mu)
-        return self._with_memory(State(mu, state.dofs))
-
-    @cached_property
-    def _default_state(self) -> _ViscousSolution:
-        return self._loaded_at(self.problem.symbols.default)
-
-    def first_state(self) -> _ViscousSolution:
-        """The response to the default loads an instant after they came."""
-        return self._default_state
-
-    def _with_memory(self, state: State) -> _ViscousSolution:
-        assert self.problem.history is not None
-        return _ViscousSolution(state.mu, state.dofs, self.problem.history.values())
-
-    def pack(self, state: _ViscousSolution) -> dict[str, Array]:
-        return {"mu": state.mu, "dofs": state.dofs, "memory": state.memory}
-
-    def unpack(self, arrays: dict[str, Array]) -> _ViscousSolution:
-        return _ViscousSolution(arrays["mu"], arrays["dofs"], arrays["memory"])
-
-    def advance(self, start: _ViscousSolution, target: Array) -> _ViscousSolution:
-        """Follow time to ``target`` (d,): on from ``start`` where that is earlier on the same path."""
-        assert self.problem.history is not None
-        same_path = np.array_equal(np.delete(start.mu, self._clock), np.delete(target, self._clock))
-        if not same_path or start.mu[self._clock] > target[self._clock]:
-            start = self._loaded_at(self._at_time(target, self.problem.symbols.default[self._clock]))
-        self.problem.history.restore(start.memory)
-        state = State(start.mu, start.dofs)
-        begin, end = start.mu[self._clock], target[self._clock]
-        times = self._times(begin, end)
-        if len(times):
-            state = follow(self.problem, state, np.array([self._at_time(target, time) for time in times]))
-        return self._with_memory(State(target, state.dofs))
-
-    def _times(self, begin: float, end: float) -> Array:
-        """Ends of the increments of time from ``begin`` to ``end``, s; amplitudes have their corners at some."""
-        corners = {t for amplitude in self.problem.symbols.amplitudes.values() for t in amplitude.times}
-        ends = np.array([begin, *sorted(t for t in corners if begin < t < end), end])
-        parts = []
-        for first, last in pairwise(ends):
-            count = int(np.ceil((last - first) / self._step - 1e-9))
-            parts.append(np.linspace(first, last, count + 1)[1:])
-        return np.concatenate(parts)
-
-    def _at_time(self, mu: Array, time: float) -> Array:
-        moment = mu.copy()
-        moment[self._clock] = time
-        return moment
-
-    def take_snapshot(self, state: _ViscousSolution) -> Snapshot:
-        """Fields at the nodes and reactions; no derivatives."""
-        assert self.problem.history is not None
-        self.problem.history.restore(state.memory)
-        return solid_snapshot(self.problem, state.dofs, state.mu)

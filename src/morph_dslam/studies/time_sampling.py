@@ -9,6 +9,7 @@ through the closed forms miss no middle.
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,9 @@ from morph_dslam.reduction.line_functions import interpolate_line
 from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.body_study import range_ends
 from morph_dslam.studies.solid_sections import Value
-from morph_dslam.studies.solid_study import SolidStudy
+
+if TYPE_CHECKING:
+    from morph_dslam.studies.solid_study import SolidStudy
 
 Array = NDArray[np.float64]
 #: Intervals that there are at least.
@@ -28,6 +31,22 @@ LEAST = 8
 SHORTEST, MOST = 1e-4, 400
 #: Where splines are compared within each interval.
 WITHIN = (0.25, 0.5, 0.75)
+
+
+def time_increments(study: SolidStudy) -> Array:
+    """Ends of the increments of time (n,), s, from the beginning of the range to its end.
+
+    They are no longer than the study's step, short where a linear body answers fast, and end at corners of amplitudes:
+    so any two paths have the same ones, and solutions are smooth in time.
+    """
+    assert study.time is not None
+    instants = time_instants(study)
+    corners = [time for amplitude in study.amplitudes().functions.values() for time in amplitude.times]
+    inside = [time for time in corners if instants[0] < time < instants[-1]]
+    marks = np.unique(np.concatenate([instants, inside]))
+    counts = np.ceil(np.diff(marks) / study.time.step - 1e-9).astype(int)
+    parts = [np.linspace(*ends, count + 1)[1:] for ends, count in zip(pairwise(marks), counts, strict=True)]
+    return np.concatenate([marks[:1], *parts])
 
 
 def time_instants(study: SolidStudy) -> Array:
