@@ -266,7 +266,7 @@ def test_reactions_balance_the_loads() -> None:
     np.testing.assert_allclose(sum(moment for _, moment in reactions), -moment, rtol=1e-8)
 
 
-@pytest.mark.parametrize("problem_of", [by_rotation, by_pressure, by_dead_loads])
+@pytest.mark.parametrize("problem_of", [by_rotation, by_pressure, by_dead_loads, by_foundation, by_shape])
 def test_reactions_have_derivatives(problem_of: Callable[[ParameterSymbols], SolidProblem]) -> None:
     """Forces and moments about the origin, of supports that stay and that move, against central differences."""
     problem = problem_of(load_parameter(p=0.3))

@@ -303,7 +303,8 @@ def _force_fields(model: ReducedModel) -> dict[str, SeparatedField]:
     if not fields:
         raise EvaluationError(
             f"the model '{model.name}' holds no reaction of a support. Models do, unless they were turned about the "
-            "axis of a body of revolution or come from solutions of another program without [external.reactions]"
+            "axis of a body of revolution, come from solutions of another program without [external.reactions], or all "
+            "forces on their supports are rounding"
         )
     return fields
 

@@ -38,6 +38,7 @@ from morph_dslam.mechanics.solid_materials import can_be_mixed, mixed_materials,
 from morph_dslam.mechanics.solvers.linear_solver import LinearSolver, SolverMaker, TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation, State
 from morph_dslam.mechanics.spaces import DisplacementSpace, default_order
+from morph_dslam.mechanics.support_forces import SupportForces
 from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion
 from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
@@ -397,11 +398,12 @@ class SolidProblem:
 
         Parameters
         ----------
-        name : node set or surface; only what prescribed motions hold of it counts.
+        name : node set or surface. A support has the components that it holds itself, and an equal share of those
+            that others hold too; of a set that no support names, all that is held of its nodes counts.
         about : point of the moment (3,), m; None for the centroid of the set's undeformed nodes.
         """
-        forces, displacement = self._held_part(self.residual(dofs, mu)), self._by_component(dofs)
-        return self.constraints.resultant(name, forces, displacement, about)
+        forces, displacement = self._by_component(self.residual(dofs, mu)), self._by_component(dofs)
+        return self._support_forces.resultant(name, forces, displacement, about)
 
     def reaction_slopes(
         self, dofs: Array, mu: Array, dof_slopes: Array, force_slopes: Array, name: str, about: Array
@@ -416,26 +418,25 @@ class SolidProblem:
         name : node set or surface.
         about : point of the moment (3,), m.
         """
-        forces = self._held_part(self.residual(dofs, mu)), self._held_part(force_slopes)
+        forces = self._by_component(self.residual(dofs, mu)), self._by_component(force_slopes)
         displacements = self._by_component(dofs), self._by_component(dof_slopes)
-        return self.constraints.resultant_slopes(name, forces, displacements, about)
+        return self._support_forces.resultant_slopes(name, forces, displacements, about)
 
     def response_reactions(
         self, dofs: Array, mu: Array, responses: Array, forces: Array, name: str, about: Array
     ) -> tuple[Array, Array]:
         """`reaction_slopes` (c, 3) by loads that change the dofs by (c, n_dofs) and the residual by ``forces``."""
-        held = self._held_part(self.residual(dofs, mu)), self._held_part(forces)
+        held = self._by_component(self.residual(dofs, mu)), self._by_component(forces)
         displacements = self._by_component(dofs), self._by_component(responses)
-        return self.constraints.resultant_slopes(name, held, displacements, about, by_parameters=False)
+        return self._support_forces.resultant_slopes(name, held, displacements, about, by_parameters=False)
 
     def _by_component(self, dofs: Array) -> Array:
         """(..., 3, n_scalar) displacement part of (..., n_dofs)."""
         return dofs[..., : 3 * self.displacements.n_scalar].reshape(*dofs.shape[:-1], 3, -1)
 
-    def _held_part(self, forces: Array) -> Array:
-        """(..., 3, n_scalar) what supports exert, of the forces (..., n_dofs) at all dofs."""
-        by_component = self._by_component(forces)
-        return np.where(self.constraints.held.reshape(3, -1), by_component, 0.0)
+    @cached_property
+    def _support_forces(self) -> SupportForces:
+        return SupportForces(self.constraints, self.displacements, self.shape, self.supports, self.symbols)
 
     def contact_forces(self, dofs: Array, mu: Array, number: int) -> Array:
         """Forces (3, n_scalar) that a contact exerts on the solid, N, by displacement dof.

@@ -90,41 +90,15 @@ class Constraints:
         slopes = self._shape.coordinate_slopes(self._symbols)
         return weights @ self._shape.coordinates(self._symbols), np.einsum("n,dnc->dc", weights, slopes)
 
-    def resultant(self, name: str, forces: Array, displacement: Array, about: Array | None) -> tuple[Array, Array]:
-        """Force (3,) and moment (3,) of a set's part of dof ``forces`` (3, n_scalar), N.
-
-        The moment is taken at the deformed positions, ``about`` a point (3,), m, or the set's centroid.
-        """
-        if about is None:
-            about = self.centroid(name)[0]
-        dofs = self._space.dofs_on(self._mesh.set_nodes(name))
-        constant, f = self._constant[dofs], forces[:, dofs]
-        arms = (self._shape.coordinates(self._symbols)[dofs] + displacement[:, dofs].T).T
-        arms = arms - np.outer(about, constant)
-        return f @ constant, np.cross(arms.T, f.T).sum(axis=0)
-
-    def resultant_slopes(
-        self,
-        name: str,
-        forces: tuple[Array, Array],
-        displacements: tuple[Array, Array],
-        about: Array,
-        by_parameters: bool = True,
-    ) -> tuple[Array, Array]:
-        """Derivatives (d, 3) of `resultant`'s force, and of its moment about a point that stays.
-
-        ``forces`` and ``displacements`` are given with their derivatives: (3, n_scalar) and (d, 3, n_scalar). They are
-        ``by_parameters``, with which the undeformed shape may move, or by d other loads.
-        """
-        dofs = self._space.dofs_on(self._mesh.set_nodes(name))
-        constant = self._constant[dofs]
-        (f, f_slopes), (u, u_slopes) = ([part[..., dofs] for part in pair] for pair in (forces, displacements))
-        arms = self._shape.coordinates(self._symbols)[dofs] + u.T - np.outer(constant, about)
-        arm_slopes = u_slopes.transpose(0, 2, 1)
-        if by_parameters:
-            arm_slopes = arm_slopes + np.array(self._shape.coordinate_slopes(self._symbols))[:, dofs]
-        moments = np.cross(arm_slopes, f.T) + np.cross(arms, f_slopes.transpose(0, 2, 1))
-        return f_slopes @ constant, moments.sum(axis=1)
+    def shares(self) -> dict[str, Array]:
+        """(3, n_scalar) by set: the part of each held dof that its supports hold, together 1 wherever a dof is held."""
+        counts: dict[str, Array] = {}
+        for motion in self._motions:
+            own = counts.setdefault(motion.on, np.zeros((3, self._space.n_scalar)))
+            dofs = self._space.dofs_on(self._mesh.set_nodes(motion.on))
+            own[np.ix_(np.flatnonzero(motion.components), dofs)] += 1.0
+        total = np.maximum(sum(counts.values()), 1.0)
+        return {name: own / total for name, own in counts.items()}
 
     def check_rigid_motions(self, others: Array, hanging: bool = False) -> None:
         """Refuse supports that leave the body free to move as a whole (StudyError).

@@ -184,6 +184,18 @@ def reader_of(symbols: ParameterSymbols) -> Reader:
     return read
 
 
+def support_content(supports: Sequence[Any], mesh: Mesh) -> dict[str, str]:
+    """What a fingerprint says of how forces are given to supports, where earlier versions gave them otherwise.
+
+    They gave each support all that is held at its nodes, by whichever support, and foundations nothing.
+    """
+    if any(support.kind == "foundation" for support in supports):
+        return {"reactions": "of each support alone"}
+    nodes = [mesh.set_nodes(name) for name in dict.fromkeys(support.on for support in supports)]
+    shared = len(np.unique(np.concatenate(nodes))) < sum(map(len, nodes)) if nodes else False
+    return {"reactions": "of each support alone"} if shared else {}
+
+
 class BodyStudy:
     """Those methods of `morph_dslam.studies.problem.ParametricStudy` that solids and shells have alike."""
 

@@ -21,6 +21,7 @@ from morph_dslam.studies.body_study import (
     numbered,
     read_once,
     reader_of,
+    support_content,
     with_named_sets,
 )
 from morph_dslam.studies.load_sizes import shell_load_doubt
@@ -115,7 +116,9 @@ class ShellStudy(BodyStudy, Section):
         content = self.model_dump(mode="json", include={"shell", "material", "supports", "loads"})
         content["elements"] = self.solver.order
         content["parameters"] = list(self.parameters)
-        content["mesh"] = mesh_fingerprint(self.shell_mesh())
+        mesh = self.shell_mesh()
+        content["mesh"] = mesh_fingerprint(mesh)
+        content |= support_content(self.supports, mesh)
         content["code"] = [SOLVER_VERSION, SHELL_VERSION]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -29,6 +29,7 @@ from morph_dslam.studies.body_study import (
     numbered,
     read_once,
     reader_of,
+    support_content,
     with_named_sets,
 )
 from morph_dslam.studies.load_sizes import load_doubt
@@ -277,6 +278,7 @@ class SolidStudy(BodyStudy, Section):
         mesh = self.solid_mesh()
         content["mesh"] = mesh_fingerprint(self._solved(mesh))
         content["code"] = SOLVER_VERSION
+        content |= support_content(self.supports, mesh)
         content |= {"shape": shape_fingerprints(self.shape, mesh)} if self.shape else {}
         content |= self.model_dump(mode="json", include={"couplings"}) if self.couplings else {}
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}

@@ -34,7 +34,8 @@ class ForceArrows:
         if not self._reactions.names:
             raise TrackingError(
                 f"the model '{model.name}' holds no reactions of supports to draw: leave out --forces. Models "
-                "do, unless they come from solutions of another program without [external.reactions]"
+                "do, unless they come from solutions of another program without [external.reactions], or all forces on "
+                "their supports are rounding"
             )
         states = [self._reactions.forces(mu) for mu in model.spread_parameters(SAMPLES)]
         largest = max(float(np.linalg.norm(force)) for state in states for _, force in state.values())
