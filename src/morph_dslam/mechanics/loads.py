@@ -254,9 +254,10 @@ class NodalForces:
         return slopes.reshape(len(self._symbols), 3 * self._n_scalar)
 
 
-#: A reaction that never exceeds so much of the largest is rounding, and has nothing to be reduced; nor has one that
-#: never exceeds so much of what the stresses of the body could exert on the square of its size.
-NEGLIGIBLE, NEGLIGIBLE_OF_STRESS = 1e-6, 1e-9
+#: A reaction that never exceeds so much of the largest may be what Newton's method leaves in a nearly incompressible
+#: body, and has nothing to be reduced; nor has one that never exceeds so much of what the stresses of the body could
+#: exert on the square of its size.
+NEGLIGIBLE, NEGLIGIBLE_OF_STRESS = 1e-5, 1e-9
 
 
 def reaction_names(snapshots: Sequence[Snapshot], size: float) -> list[str]:
