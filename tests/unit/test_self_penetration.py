@@ -133,3 +133,31 @@ def test_an_obstacle_in_the_solid_comes_first_and_the_remedy_is_the_one_that_hel
     assert "name all surfaces" in report["statement"]
     report = obstacle_report(model_mesh_of(mesh), [state(1.25)], symbols, [(thick, mesh.set_nodes("z_max"))])
     assert report["statement"].endswith("make cells finer there")
+
+
+def test_a_support_that_moves_nodes_into_an_obstacle_is_named():
+    """The top of a block is lifted by up to 0.4 m, under a lid 0.2 m above it; a roller on its side holds x alone."""
+    mesh, lift = block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"), Parameter("lift", "length", "m", 0.0, 0.4, 0.0)
+    symbols = ParameterSymbols([lift])
+    lid = RigidPlane("z_max", (0.0, 0.0, 1.2), (0.0, 0.0, -1.0))
+    named = [(lid, mesh.set_nodes("z_max"))]
+    roller, lifted = np.zeros((2, len(mesh.nodes), 3), dtype=bool)
+    roller[mesh.set_nodes("x_min"), 0] = True
+    lifted[mesh.set_nodes("z_max"), 2] = True
+    up = Snapshot(np.array([0.4]), {"displacement": mesh.nodes * [0.0, 0.0, 0.4]})
+    for held, blamed in (({"x_min": roller}, None), ({"x_min": roller, "z_max": lifted}, "z_max")):
+        report = obstacle_report(model_mesh_of(mesh), [up], symbols, named, held)
+        assert report["states"][0]["depth_mm"] == pytest.approx(200.0)
+        assert report["states"][0].get("held_by") == blamed
+    assert "the support of 'z_max' holds nodes there" in report["statement"]
+
+
+@pytest.mark.parametrize(("depth", "counts"), [(2e-3, False), (20e-3, True)])
+def test_what_contact_gives_way_by_is_no_warning(depth, counts):
+    """On faces of 0.5 m a pressure as large as Young's modulus lets a node in by 5 mm; other nodes are kept out."""
+    mesh, idle = block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"), Parameter("idle", "length", "m", 0.0, 1.0, 0.0)
+    lid = RigidPlane("z_max", (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+    up = Snapshot(np.array([0.0]), {"displacement": np.full((len(mesh.nodes), 3), [0.0, 0.0, depth])})
+    for own, expected in (("z_max", counts), ("z_min", True)):
+        report = obstacle_report(model_mesh_of(mesh), [up], ParameterSymbols([idle]), [(lid, mesh.set_nodes(own))])
+        assert bool(report["states"]) is expected

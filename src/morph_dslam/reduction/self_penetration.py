@@ -8,7 +8,7 @@ of its own corner, between 0 and 1, and 1 more for each part that holds it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,10 @@ Array = NDArray[np.float64]
 NEARER = 0.5
 #: Nodes that are less deep than such a part of the solid's extent only touch.
 TOUCHING = 1e-4
+#: Contact lets nodes in by such a part of their faces' width where its pressure is Young's modulus, as it must.
+GIVING = 0.01
+#: A support holds a node in an obstacle where it prescribes more than such a part of the obstacle's normal there.
+HOLDING = 0.5
 #: What to do about an obstacle inside the solid.
 FELT = "contact is felt at points of the surface alone, so make cells finer than the obstacle"
 
@@ -65,35 +69,29 @@ def obstacle_report(
     solutions: Sequence[Snapshot],
     symbols: ParameterSymbols,
     obstacles: Sequence[tuple[RigidObstacle, NDArray[np.int64]]],
+    held: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> dict[str, Any]:
     """What a certificate says of solutions whose surface is in an obstacle, as `penetration_report`.
 
-    Nodes that were in an obstacle at rest, and that no contact keeps out of it, are not meant to be outside. A state
-    in which the core of an obstacle lies in the solid, where no contact may see it, has besides "inside", what messages
-    call these obstacles; such states come first.
+    Nodes that were in an obstacle at rest, and that no contact keeps out of it, are not meant to be outside. Nodes that
+    a contact names count where they are deeper than contact gives way by itself. A state has "named", whether a contact
+    names the deepest node, and "held_by", the set whose support holds this node there, if any does. One in which the
+    core of an obstacle lies in the solid, where no contact may see it, has besides "inside", what messages call these
+    obstacles; such states come first.
 
     Parameters
     ----------
     symbols : of the parameters that move the obstacles.
     obstacles : each with the nodes that its contact names.
+    held : by set, (n, 3) whether its supports prescribe a node's component; None for no supports.
     """
-    on_surface, states = np.unique(mesh.triangles), []
-    named = np.unique(np.concatenate([nodes for _, nodes in obstacles]))
-    symbols.set(symbols.default)
-    meant = []
-    for obstacle, own in obstacles:
-        outside = obstacle.touch(symbols, mesh.nodes[on_surface]).gap >= 0.0
-        meant.append(on_surface[outside | np.isin(on_surface, own)])
-    bodies = [obstacle for obstacle, _ in obstacles]
+    named, states = np.unique(np.concatenate([nodes for _, nodes in obstacles])), []
+    kept, bodies = _kept_outside(mesh, symbols, obstacles), [obstacle for obstacle, _ in obstacles]
     for solution in solutions:
         symbols.set(solution.coordinates)
         places = mesh.nodes + solution.fields["displacement"]
-        depths = [
-            -obstacle.touch(symbols, places[nodes]).gap - obstacle.tolerance
-            for obstacle, nodes in zip(bodies, meant, strict=True)
-        ]
-        entered = np.concatenate(depths), np.concatenate(meant)
-        states += _in_obstacles(mesh, solution, entered, named, _enclosed(bodies, symbols, places, mesh.triangles))
+        entered, inside = _entered(kept, symbols, places), _enclosed(bodies, symbols, places, mesh.triangles)
+        states += _in_obstacles(mesh, solution, entered, (named, held or {}), inside)
     # Those that hold an obstacle come first, and stay so where all are sorted by depth.
     holding = [state for state in states if "inside" in state]
     others = [state for state in states if "inside" not in state]
@@ -102,6 +100,64 @@ def obstacle_report(
         return report
     what = f"{holding[0]['inside'][0]} lies inside the solid"
     return _report(symbols.parameters, len(solutions), holding, what, FELT) | {"states": holding + others}
+
+
+@dataclass(frozen=True)
+class _Entered:
+    """How deep nodes are in obstacles.
+
+    Attributes
+    ----------
+    depths : (k,), m; 0 or less outside.
+    nodes : (k,) their indices.
+    normals : (k, 3) of the obstacle at each.
+    """
+
+    depths: Array
+    nodes: NDArray[np.int64]
+    normals: Array
+
+    def deepest(self, named: NDArray[np.int64], held: Mapping[str, NDArray[np.bool_]]) -> dict[str, Any]:
+        """Whether a contact names the deepest node, and the set whose support holds it along the obstacle's normal."""
+        at = int(self.depths.argmax())
+        node, normal = self.nodes[at], self.normals[at]
+        sets = [name for name, components in held.items() if np.linalg.norm(normal[components[node]]) > HOLDING]
+        return {"named": bool(node in named)} | ({"held_by": sets[0]} if sets else {})
+
+
+def _kept_outside(
+    mesh: ModelMesh, symbols: ParameterSymbols, obstacles: Sequence[tuple[RigidObstacle, NDArray[np.int64]]]
+) -> list[tuple[RigidObstacle, NDArray[np.int64], Array]]:
+    """Each obstacle with the nodes (k,) that are meant to be outside, and the depth (k,) that contact lets them in."""
+    on_surface, widths, result = np.unique(mesh.triangles), _face_widths(mesh), []
+    symbols.set(symbols.default)
+    for obstacle, own in obstacles:
+        outside = obstacle.touch(symbols, mesh.nodes[on_surface]).gap >= 0.0
+        nodes = on_surface[outside | np.isin(on_surface, own)]
+        result.append((obstacle, nodes, np.where(np.isin(nodes, own), GIVING * widths[nodes], 0.0)))
+    return result
+
+
+def _entered(
+    kept: Sequence[tuple[RigidObstacle, NDArray[np.int64], Array]], symbols: ParameterSymbols, places: Array
+) -> _Entered:
+    """How deep nodes are in obstacles with nodes at ``places`` (n, 3); as far as contact lets them in is not deep."""
+    depths, normals = [], []
+    for obstacle, nodes, least in kept:
+        touch = obstacle.touch(symbols, places[nodes])
+        depth = -touch.gap - obstacle.tolerance
+        depths.append(np.where(depth > least, depth, 0.0))
+        normals.append(touch.normal)
+    return _Entered(np.concatenate(depths), np.concatenate([nodes for _, nodes, _ in kept]), np.concatenate(normals))
+
+
+def _face_widths(mesh: ModelMesh) -> Array:
+    """(n,) mean side of the triangles around each node of the surface, m; 0 inside."""
+    sides = np.linalg.norm(mesh.nodes[mesh.triangles] - mesh.nodes[np.roll(mesh.triangles, -1, axis=1)], axis=2)
+    total, count = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))
+    np.add.at(total, mesh.triangles, sides.mean(axis=1)[:, None])
+    np.add.at(count, mesh.triangles, 1.0)
+    return total / np.maximum(count, 1.0)
 
 
 def _enclosed(
@@ -120,15 +176,12 @@ def _enclosed(
 def _in_obstacles(
     mesh: ModelMesh,
     solution: Snapshot,
-    entered: tuple[Array, NDArray[np.int64]],
-    named: NDArray[np.int64],
+    entered: _Entered,
+    known: tuple[NDArray[np.int64], Mapping[str, NDArray[np.bool_]]],
     enclosed: dict[str, float],
 ) -> list[dict[str, Any]]:
-    """One state, if nodes are more than touching by depths (k,), of nodes (k,), or obstacles are ``enclosed``."""
-    depths, nodes = entered
-    states = _deep(mesh, solution, depths)
-    for state in states:
-        state["named"] = bool(np.isin(nodes[depths.argmax()], named))
+    """One state, if nodes are more than touching, or obstacles are ``enclosed``; ``known`` as `_Entered.deepest`."""
+    states = [state | entered.deepest(*known) for state in _deep(mesh, solution, entered.depths)]
     if enclosed:
         found = states[0] if states else {"coordinates": solution.coordinates.tolist(), "nodes": 0, "depth_mm": 0.0}
         deepest = max(found["depth_mm"], 1e3 * max(enclosed.values()))
@@ -137,8 +190,17 @@ def _in_obstacles(
 
 
 def _remedy(states: Sequence[dict[str, Any]]) -> str:
-    """What to do about nodes in an obstacle: those that no contact names come in freely, others as cells give way."""
+    """What to do about nodes in an obstacle.
+
+    Those that a support holds stay there whatever the mesh, those that no contact names come in freely, and others as
+    cells give way.
+    """
     worst = max(states, key=lambda state: state["depth_mm"], default={"named": True})
+    if "held_by" in worst:
+        return (
+            f"the support of '{worst['held_by']}' holds nodes there, and its force is that of the penalty alone: "
+            "change the range of what moves the support or the obstacle, so that they do not meet"
+        )
     return "make cells finer there" if worst["named"] else "name all surfaces that meet it in [[contacts]]"
 
 

@@ -141,7 +141,9 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     model = certified_model(snapshots, chosen.reduction, chosen.name, _fallback(study.reduction))
     if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
         solutions = [*(group[0] for group in snapshots.training), *snapshots.held_out]
-        model.certificate["obstacle_penetration"] = obstacle_report(snapshots.mesh, solutions, *chosen.obstacles())
+        model.certificate["obstacle_penetration"] = obstacle_report(
+            snapshots.mesh, solutions, *chosen.obstacles(), chosen.held_components()
+        )
     if isinstance(chosen, SolidStudy | ShellStudy) and chosen.unknown_loads is not None:
         announce("reducing the responses to unknown loads")
         loads, model.certificate["unknown_loads"] = reduce_unknown_loads(chosen, chosen.unknown_loads, snapshots)

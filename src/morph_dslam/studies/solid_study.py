@@ -354,6 +354,15 @@ class SolidStudy(BodyStudy, Section):
         rigid = [section.make(reader_of(symbols)) for section in self.contacts if section.kind != "surface"]
         return symbols, [(body, mesh.set_nodes(body.on)) for body in rigid]
 
+    def held_components(self) -> dict[str, NDArray[np.bool_]]:
+        """By set, (n, 3) whether its supports prescribe the component of a node's displacement."""
+        mesh, held = self.solid_mesh(), {}
+        reader = reader_of(self._symbols())
+        for section in (part for part in self.supports if part.kind != "foundation"):
+            of_set = held.setdefault(section.on, np.zeros((mesh.n_nodes, 3), dtype=bool))
+            of_set[mesh.set_nodes(section.on)] |= np.array(section.make(reader).components)
+        return held
+
     def _applied_first(self) -> list[Any]:
         """Supports, loads and couplings that act before the others."""
         return [section for section in (*self.supports, *self.loads, *self.couplings) if section.first]
