@@ -99,7 +99,7 @@ def test_every_format_can_be_read_with_the_documented_program(tmp_path, reader, 
 def test_the_programs_for_solids_pull_a_block_as_far_as_its_law_says(tmp_path, monkeypatch):
     """E = 3 MPa, nu = 0, nominal stress 0.3 MPa = mu (s - 1/s): the stretch s is 1.104988."""
     monkeypatch.chdir(tmp_path)
-    study, problem = samples("solid-study", "python")
+    study, problem, _ = samples("solid-study", "python")
     names = {}
     exec(study, names)
     top = names["model"].nodes[:, 2] > 0.0599

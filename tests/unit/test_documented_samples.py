@@ -364,7 +364,7 @@ def test_every_program_is_run_by_a_test():
         "run-folder": 1,
         "scene-file": 1,
         "slam": 2,
-        "solid-study": 2,
+        "solid-study": 3,
         "sources": 1,
         "streams": 1,
     }
@@ -419,3 +419,35 @@ def test_evaluation_in_memory(tmp_path, monkeypatch):
 def test_unknown_loads():
     section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[7])["unknown_loads"])
     assert (section.on, section.direction, section.modes) == ("top", "inward", 60)
+
+
+def clamped_arch(young: float, thickness: float, radius: float, angle: float) -> np.ndarray:
+    """Sinks of the middle, m, and loads, Pa, (2, n) of a shallow clamped arch of unit width that stays symmetric.
+
+    With the thrust N and the half span a, E I w'''' + N w'' = q - N / R gives w' = B (x - a sin(kx) / sin(ka)), where
+    k^2 = N / (E I) and B = (q - N / R) / N; the arch shortens by N a / (E A) = -int x w' / R + w'^2 / 2 dx.
+    """
+    a, stiffness = radius * np.sin(angle), young * thickness**3 / 12.0
+    x, curve = np.linspace(0.0, a, 2001), []
+    for share in np.linspace(0.0031, 2.5531, 1276):  # N over Euler's load of the span, at 1 of which sin(ka) = 0
+        thrust = share * stiffness * (np.pi / a) ** 2
+        k = np.sqrt(thrust / stiffness)
+        slope = x - a * np.sin(k * x) / np.sin(k * a)
+        square, along, sink = (np.trapezoid(part, x) for part in (slope**2, x * slope, slope))
+        both = np.roots([square / 2.0, along / radius, thrust * a / (young * thickness)])
+        curve += [(-b * sink, thrust * (b + 1.0 / radius)) for b in both if np.isreal(b)]
+    return np.array(sorted(curve)).real.T
+
+
+def test_an_arch_that_snaps_through() -> None:
+    """Against the closed form, whose load has a maximum of 35.8 Pa and a minimum of 13.2 Pa."""
+    names = run_sample("solid-study", 2)
+    loads, sinks, stable = (np.array(names[name]) for name in ("loads", "sinks", "stable"))
+    assert (loads[0], loads[-1]) == (0.0, pytest.approx(40.0))
+    assert (np.diff(sinks) > 0.0).all()
+    expected = np.interp(sinks, *clamped_arch(1e8, 0.5e-3, 0.40025, np.radians(5.0)))
+    np.testing.assert_allclose(loads[1:], expected[1:], atol=0.5)
+    falls = np.array([point.rate < 0.0 for point in names["points"]])
+    assert falls.sum() >= 3
+    assert not stable[falls].any()
+    assert stable[[0, -1]].all()

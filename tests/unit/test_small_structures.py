@@ -49,6 +49,12 @@ def test_a_path_whose_end_has_the_wrong_sign_is_refused() -> None:
         list(ArcLength(von_mises_truss(HEIGHT)).follow(at_rest(), lambda state: 0.01 - state.mu[0]))
 
 
+def test_a_path_whose_end_is_a_condition_is_refused() -> None:
+    """False is no place on the path: it would end where it starts."""
+    with pytest.raises(SolverError, match="`end` returns False: it has to return a number"):
+        list(ArcLength(von_mises_truss(HEIGHT)).follow(at_rest(), lambda state: state.mu[0] > 0.01))
+
+
 def test_imposed_motion_passes_where_a_load_cannot() -> None:
     """Through a spring of stiffness 1, stiffer than the truss is unstable, to beyond the truss' limit."""
     state = advance(von_mises_truss(HEIGHT, moved=True), at_rest(2), np.array([0.5]))[-1]

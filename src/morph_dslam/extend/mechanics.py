@@ -50,6 +50,12 @@ from morph_dslam.mechanics.parameters import ParameterSymbols as ParameterSymbol
 from morph_dslam.mechanics.rigid_mesh import RigidMesh as RigidMesh
 from morph_dslam.mechanics.solid import SolidOptions as SolidOptions
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning as NearlyIncompressibleWarning
+from morph_dslam.mechanics.solvers.arc_length import (
+    ArcLength as ArcLength,
+    ArcOptions as ArcOptions,
+    missed_bifurcations as missed_bifurcations,
+)
+from morph_dslam.mechanics.solvers.buckling import buckling_modes as buckling_modes
 from morph_dslam.mechanics.solvers.continuation import advance as advance, loaded_state as loaded_state
 from morph_dslam.mechanics.solvers.newton import State as State, sensitivities as sensitivities, solve as solve
 from morph_dslam.mechanics.supports import (

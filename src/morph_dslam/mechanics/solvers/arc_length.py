@@ -200,7 +200,8 @@ class ArcLength:
     ) -> Iterator[PathPoint]:
         """Points of the path, its start first, with steps as long as they converge quickly.
 
-        Raises SolverError naming the last parameters that converged, when steps become too short.
+        Raises SolverError for an ``end`` that is positive at the start or no number, and, naming the last parameters
+        that converged, when steps become too short.
 
         Parameters
         ----------
@@ -211,7 +212,13 @@ class ArcLength:
         """
         options = self.options
         point = self.begin(start, sense) if isinstance(start, State) else start
-        if end(point.state) > 0.0:
+        before = end(point.state)
+        if isinstance(before, bool | np.bool_):
+            raise SolverError(
+                f"`end` returns {before}: it has to return a number that is negative before the path's end and grows "
+                "through zero there, as that of lambda state: state.mu[0] - target does"
+            )
+        if before > 0.0:
             begin = where(self.equations, point.state.mu)
             raise SolverError(f"`end` is positive at the path's start, {begin}: it has to grow through zero at the end")
         length = point.step or options.first
