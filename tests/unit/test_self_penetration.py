@@ -12,6 +12,8 @@ from morph_dslam.meshing.meshes import model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.reduction.self_penetration import SurfaceContact, obstacle_report, penetration_report
 from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studies.solid_study import SolidStudy
+from morph_dslam.studies.study import make_study
 
 THICK, LENGTH, RADIUS = 1.0, 40.0, 6.0
 
@@ -161,3 +163,24 @@ def test_what_contact_gives_way_by_is_no_warning(depth, counts):
     for own, expected in (("z_max", counts), ("z_min", True)):
         report = obstacle_report(model_mesh_of(mesh), [up], ParameterSymbols([idle]), [(lid, mesh.set_nodes(own))])
         assert bool(report["states"]) is expected
+
+
+def test_a_study_says_which_components_its_supports_hold():
+    """Springs hold no node, and two supports of one set hold what either does."""
+    springs = {"kind": "foundation", "on": "y_min", "stiffness": "1 MPa/mm"}
+    rollers = [{"kind": "displacement", "on": "z_max", axis: "lift"} for axis in "xz"]
+    study = make_study(
+        {
+            "name": "block",
+            "mesh": {"generator": "block", "size": ["1 mm"] * 3, "divisions": [1, 1, 1], "cells": "hex8"},
+            "materials": {"m": {"law": "neo_hookean", "young": "1 MPa", "poisson": 0.3}},
+            "supports": [{"kind": "fixed", "on": "z_min"}, *rollers, springs],
+            "parameters": {"lift": {"range": ["0 mm", "0.1 mm"]}},
+        }
+    )
+    assert isinstance(study, SolidStudy)
+    held = study.held_components()
+    assert held.keys() == {"z_min", "z_max"}
+    low = study.solid_mesh().nodes[:, 2] < 0.5e-3
+    assert (held["z_min"] == np.outer(low, [True, True, True])).all()
+    assert (held["z_max"] == np.outer(~low, [True, False, True])).all()
