@@ -27,7 +27,7 @@ _MODULES = {
     "SimulatedSequence": "render.simulation",
     "SlamOptions": "slam.options",
     "SolidProblem": "mechanics.solid",
-    "StateChoice": "io.export",
+    "StateChoice": "io.state_choice",
     "Status": "tracking.outcomes",
     "TrackOptions": "tracking.run_options",
     "Tracker": "tracking.tracker",
@@ -71,7 +71,8 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.evaluation.trajectory import evaluate_trajectory as evaluate_trajectory
     from morph_dslam.explorer.server import explore as explore
     from morph_dslam.io.camera_files import load_camera as load_camera
-    from morph_dslam.io.export import StateChoice as StateChoice, export as export
+    from morph_dslam.io.export import export as export
+    from morph_dslam.io.state_choice import StateChoice as StateChoice
     from morph_dslam.mechanics.solid import SolidProblem as SolidProblem
     from morph_dslam.model import (
         Parameter as Parameter,

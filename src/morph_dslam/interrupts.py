@@ -59,6 +59,11 @@ class WaitingInterrupts:
                 print(f"\n{self._said}", file=sys.stderr, flush=True)
         self._waiting = number
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an interrupt waits, so that the work can end early."""
+        return self._waiting is not None
+
     def raise_waiting(self) -> None:
         """Raise the interrupt that waits, if there is one."""
         if self._waiting is not None:

@@ -16,9 +16,9 @@ from morph_dslam.evaluation.pixels import load_tracks
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.export import read_path
 from morph_dslam.io.folders import make_run_folder, only_writer
 from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.io.state_choice import read_path
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.inp_writing import save_mesh

@@ -13,8 +13,8 @@ from morph_dslam import make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.extend.reports import load_tracks
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.export import StateChoice
 from morph_dslam.io.landmarks import load_landmarks
+from morph_dslam.io.state_choice import StateChoice
 from morph_dslam.mechanics.materials.user import UserMaterial
 from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
 from morph_dslam.model import Parameter, save_model

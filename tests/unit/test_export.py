@@ -1,7 +1,9 @@
 """Exports read back by other programs' readers: the states, the mesh, and every field in closed form."""
 
 import csv
+import signal
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import meshio
 import numpy as np
@@ -13,10 +15,12 @@ from matplotlib.colors import Normalize
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import ExportError, ParameterError
 from morph_dslam.extend.studies import build_rigid
-from morph_dslam.io.export import StateChoice, export
+from morph_dslam.io.export import export
 from morph_dslam.io.gltf import FRAMES_PER_SECOND
+from morph_dslam.io.state_choice import StateChoice
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import save_model
+from morph_dslam.studies.external_table import SolutionTable
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
 
@@ -283,6 +287,87 @@ def test_a_path_from_a_table_of_states_and_from_a_tracked_run(tmp_path):
     frames.write_text("frame,slide_mm,slide_std_mm\n0,1,0.1\n1,,\n2,10.000001,0.1\n")
     found = StateChoice(path=frames, at=["stretch=0.1"]).states(model)
     np.testing.assert_allclose(found, [[0.1, 0.001], [0.1, 0.01]], rtol=1e-12)
+
+
+def times_of_series(folder):
+    """Those of the XDMF series by meshio, or of the collection of VTU files."""
+    if (folder / "stretched_block.pvd").exists():
+        sets = ElementTree.parse(folder / "stretched_block.pvd").getroot().iter("DataSet")
+        return [float(part.get("timestep", "nan")) for part in sets]
+    with meshio.xdmf.TimeSeriesReader(folder / "stretched_block.xdmf") as series:
+        series.read_points_cells()
+        return [series.read_data(i)[0] for i in range(series.num_steps)]
+
+
+@pytest.mark.parametrize("file_format", ["xdmf", "vtu"])
+@pytest.mark.parametrize(
+    ("rows", "origins", "times"),
+    [
+        ("frame,time_s,slide_mm\n7,0.5,1\n8,,\n12,0.75,2\n", {"from_frame": ["7", "12"]}, [0.5, 0.75]),
+        ("slide_mm,time [s]\n1,1e9\n\n2,1000000000.25\n", {"from_line": ["2", "4"]}, [1e9, 1e9 + 0.25]),
+        ("slide_mm,timestamp_s\n1,0.5\n2,0.75\n", {"from_line": ["2", "3"]}, [0, 1]),
+        ("slide_mm,time_s\n1,0.5\n2,0.5\n", {"from_line": ["2", "3"]}, [0, 1]),  # of a grid
+        ("slide_mm,time_s\n1,0.5\n2,\n", {"from_line": ["2", "3"]}, [0, 1]),
+    ],
+)
+def test_states_of_a_path_say_where_and_when_they_are(rows, origins, times, file_format, tmp_path):
+    (tmp_path / "path.csv").write_text(rows)
+    export(stretched_block_model(), tmp_path / "out", file_format, StateChoice(path=tmp_path / "path.csv"))
+    found = table(tmp_path / "out" / "states.csv")
+    assert {title: [row[title] for row in found] for title in found[0] if title.startswith("from")} == origins
+    np.testing.assert_allclose(times_of_series(tmp_path / "out"), times, rtol=1e-15)
+
+
+def test_a_study_takes_the_table_of_an_exported_path(tmp_path):
+    (tmp_path / "frames.csv").write_text("frame,slide_mm,stretch_1\n3,1,0.1\n4,2,-0.1\n")
+    export(stretched_block_model(), tmp_path / "out", "vtu", StateChoice(path=tmp_path / "frames.csv"))
+    parameters, values = SolutionTable(tmp_path / "out" / "states.csv").parameters()
+    assert [p.name for p in parameters] == ["stretch", "slide"]
+    np.testing.assert_allclose(values, [[0.1, 0.001], [-0.1, 0.002]])
+
+
+class Interrupting:
+    """Functions of the parameters, the third use of which comes with Ctrl-C."""
+
+    def __init__(self, functions):
+        self._functions, self._used = functions, 0
+
+    def __getattr__(self, name):
+        return getattr(self._functions, name)
+
+    def rows(self, mu):
+        self._used += 1
+        if self._used == 3:
+            signal.raise_signal(signal.SIGINT)
+        return self._functions.rows(mu)
+
+
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("file_format", ["xdmf", "vtu", "gltf"])
+def test_what_an_interrupted_export_leaves_is_whole(file_format, tmp_path):
+    """Three states of ten, the third of which was interrupted; of an animation nothing, nor of the export before."""
+    model = stretched_block_model()
+    export(model, tmp_path, file_format, np.zeros((4, 2)))
+    displacement = replace(model.displacement, functions=Interrupting(model.displacement.functions))
+    states = np.column_stack([np.zeros(10), np.linspace(0.0, 9e-3, 10)])
+    with pytest.raises(KeyboardInterrupt):
+        export(replace(model, displacement=displacement), tmp_path, file_format, states)
+    if file_format == "gltf":
+        assert not list(tmp_path.iterdir())
+        return
+    rows = table(tmp_path / "states.csv")
+    np.testing.assert_allclose([float(row["slide [mm]"]) for row in rows], [0.0, 1.0, 2.0], atol=1e-9)
+    assert times_of_series(tmp_path) == [0, 1, 2]
+    if file_format == "vtu":
+        meshes = [meshio.read(tmp_path / row["file"]) for row in rows]
+        found = [(mesh.points, mesh.cells[0].data, mesh.point_data) for mesh in meshes]
+        assert len(list(tmp_path.glob("*.vtu"))) == 3
+    else:
+        with meshio.xdmf.TimeSeriesReader(tmp_path / "stretched_block.xdmf") as series:
+            points, cells = series.read_points_cells()
+            found = [(points, cells[0].data, series.read_data(i)[1]) for i in range(3)]
+    for i, parts in enumerate(found):
+        assert_block_state(*parts, 0.0, float(i))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import argparse
 from morph_dslam.cli.arguments import add_file, add_output, add_repeated
 
 HELP = "write a model's deformed states for ParaView (XDMF, VTU) or 3-D viewers (glTF)"
-KEPT = "the files written so far are kept"
+KEPT = "the states written so far, if any, are kept with their table; of a glTF file nothing"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

@@ -16,8 +16,8 @@ from morph_dslam.units import FACTORS, quantity_of, read_quantity, to_si
 
 Array = NDArray[np.float64]
 _COLUMN = re.compile(r"\s*(?P<name>\w+)\s*(?:\[(?P<unit>[^\]]+)\])?\s*")
-#: Columns that say where a solution is.
-PLACES = ("file", "step")
+#: Columns that say where a solution is, and in tables of exports where it comes from.
+PLACES = ("file", "step", "from_frame", "from_line")
 #: Parameters are the same where they differ by less than this share of their ranges.
 SAME_PARAMETERS = 1e-9
 _UNITS = {unit for known in FACTORS.values() for unit in known} - {"1"}
