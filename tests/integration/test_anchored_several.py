@@ -48,7 +48,8 @@ def also(folder, name, start=None):
 def test_two_objects_are_tracked_in_one_map(recording, tmp_path, capsys):
     folder, truth = recording
     run = tmp_path / "run"
-    assert main(command(folder, run, *also(folder, "wedge"))) == 0
+    log = tmp_path / "frames.jsonl"
+    assert main(command(folder, run, *also(folder, "wedge"), "--frame-log", log)) == 0
     assert capsys.readouterr().out.count(f"tracked={FRAMES - SCAN + 1}/{FRAMES - SCAN + 1}") == 2
     for name, output in (("sheet", run), ("wedge", run / "wedge")):
         assert errors(folder, truth, name, output).max() < MAP_ERROR
@@ -56,6 +57,11 @@ def test_two_objects_are_tracked_in_one_map(recording, tmp_path, capsys):
     expected = {name: truth[name]["parameters"][SCAN - 1 :] for name in truth}
     np.testing.assert_allclose(load_run(run).parameters[:, 0], expected["sheet"][:, 0], atol=0.3e-3)
     np.testing.assert_allclose(load_run(run / "wedge").parameters, expected["wedge"], atol=0.5e-3)
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["frame"] for line in lines] == np.repeat(range(SCAN - 1, FRAMES), 2).tolist()
+    for name, output in (("sheet", run), ("wedge", run / "wedge")):
+        logged = [line["camera_from_object"] for line in lines if line["object"] == name]
+        np.testing.assert_array_equal(logged, column(output, "camera_from_object"))
     # The camera was found once a frame, for both.
     np.testing.assert_array_equal(locate_ms(run), locate_ms(run / "wedge"))
     assert (locate_ms(run) > 0.0).all()

@@ -159,7 +159,7 @@ def test_runs(tmp_path: Path) -> None:
 
 def test_frame_logs(tmp_path: Path) -> None:
     run = tracked_run(tmp_path / "run")
-    log = FrameLog(Path("/dev/full"), run)
+    log = FrameLog(Path("/dev/full"), {"sheet": run})
     with pytest.raises(TrackingError, match="cannot write /dev/full: No space left on device"):
         log(SimpleNamespace())  # what it writes is the run's last frame
 
@@ -169,10 +169,10 @@ def test_what_a_run_that_was_killed_left_is_kept(tmp_path: Path) -> None:
     log, run = tmp_path / "frames.jsonl", tracked_run(tmp_path / "run")
     log.write_text('{"frame": 3}\n')
     with pytest.raises(TrackingError, match=r"frames\.jsonl holds an earlier run: .*move this one, .*--overwrite"):
-        FrameLog(log, run)
+        FrameLog(log, {"sheet": run})
     assert log.read_text() == '{"frame": 3}\n'
     again = RunFolder(tmp_path / "run", "sheet", run.results, CAMERA, overwrite=True)
-    FrameLog(log, again)(SimpleNamespace())
+    FrameLog(log, {"sheet": again})(SimpleNamespace())
     assert [json.loads(line)["status"] for line in log.read_text().splitlines()] == ["tracked"]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +59,14 @@ def _is_line_of_log(line: bytes) -> bool:
 
 
 class FrameLog:
-    """Appends a line of JSON for each frame that a run folder has taken in (docs/run-folder.md).
+    """Appends a line of JSON for each frame, and each object, that run folders have taken in (docs/run-folder.md).
 
     Parameters
     ----------
     path : file to write; what it held is gone: `check_frame_log` says whether it may be.
-    folder : whose last frame is written; in a session's sinks it comes first. Where it may not replace a run, the log
-        of an earlier one is not replaced either: of a run that was killed it may be all that is left.
+    folders : by the objects' names, whose last frame is written; in a session's sinks they come first. Where they may
+        not replace a run, the log of an earlier one is not replaced either: of a run that was killed it may be all that
+        is left.
 
     Raises
     ------
@@ -73,12 +74,13 @@ class FrameLog:
         If the file cannot be written, or has frames of an earlier run that are not to be replaced.
     """
 
-    def __init__(self, path: Path, folder: RunFolder) -> None:
-        self._path, self._folder = path, folder
-        if not folder.overwrite and path.is_file() and path.stat().st_size:
+    def __init__(self, path: Path, folders: Mapping[str, RunFolder]) -> None:
+        self._path, self._folders = path, folders
+        first = next(iter(folders.values()))
+        if not first.overwrite and path.is_file() and path.stat().st_size:
             raise TrackingError(
                 f"the frame log {path} holds an earlier run: name another file, move this one, or allow both it and "
-                f"{folder.path} to be replaced (`--overwrite`)"
+                f"{first.path} to be replaced (`--overwrite`)"
             )
         self.start_again()
 
@@ -88,9 +90,11 @@ class FrameLog:
             self._path.write_text("")
 
     def __call__(self, tracked: TrackedFrame) -> None:
-        """Write the frame that the run folder has just taken in."""
+        """Write the frame that the run folders have just taken in; of several objects each line has the name."""
+        several = len(self._folders) > 1
+        lines = [({"object": name} if several else {}) | _line(run.results) for name, run in self._folders.items()]
         with writing(TrackingError, self._path), self._path.open("a") as file:
-            file.write(json.dumps(_line(self._folder.results)) + "\n")
+            file.write("".join(json.dumps(line) + "\n" for line in lines))
 
 
 def _line(run: RunResults) -> dict[str, Any]:

@@ -76,7 +76,7 @@ class TrackOptions(ObjectOptions):
     drawing : what is drawn.
     overwrite : whether to replace a run that is in the folder.
     streams : where results go as they come, for other programs (docs/streams.md).
-    frame_log : file that gets a line of JSON for each frame of the first object as soon as it is tracked.
+    frame_log : file that gets a line of JSON for each frame, and each object, as soon as it is tracked.
     """
 
     frames: Path | str

@@ -228,7 +228,8 @@ class _Job:
             for part in placed
             if _checks_camera(part, run)
         }
-        self._log = None if run.frame_log is None else FrameLog(run.frame_log, self._folders[0])
+        named = dict(zip(run.stream_names, self._folders, strict=True))
+        self._log = None if run.frame_log is None else FrameLog(run.frame_log, named)
         self._streams = self._opened_streams(stack)
         sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
         self._video = stack.enter_context(ExitStack())
