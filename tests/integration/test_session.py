@@ -1,6 +1,7 @@
 """Several objects, several cameras, and what goes with them, on rendered sheets with known states."""
 
 import shutil
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -15,6 +16,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_rig
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
+from morph_dslam.sources.frames import MissingFrame
 from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
@@ -335,15 +337,19 @@ def with_both_cameras(folder, output, *more, camera="camchain.yaml#cam0"):
     ]  # fmt: skip
 
 
+def assert_follows_the_sheet(run, model):
+    for row, time in enumerate([0.0, *RIG_TIMES[:4]]):
+        state = sheet_state(time)
+        exact = state.camera_from_object.apply(model.positions(state.parameters))
+        assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.4e-3
+
+
 def test_the_command_tracks_with_both_cameras(model, rig_recording_of_sheet, tmp_path, capsys, refused):
     folder = rig_recording_of_sheet
     assert run_command(with_both_cameras(folder, tmp_path / "run")) == 0
     assert "tracked=5/5" in capsys.readouterr().out
     run = load_run(tmp_path / "run")
-    for row, time in enumerate([0.0, *RIG_TIMES[:4]]):
-        state = sheet_state(time)
-        exact = state.camera_from_object.apply(model.positions(state.parameters))
-        assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.4e-3
+    assert_follows_the_sheet(run, model)
     assert "has 2 cameras, but there are 3" in refused(
         *with_both_cameras(folder, tmp_path / "again", "--with", folder / "aside")
     )
@@ -376,7 +382,7 @@ def test_cameras_that_do_not_agree_are_named_and_one_recording_twice_is_refused(
 def test_frames_of_different_numbers_do_not_go_together(rig_recording_of_sheet):
     front, aside = (md.open_source(rig_recording_of_sheet / "front", first) for first in (0, 1))
     both = SynchronizedFrames([front, aside])
-    assert len(both) == 4
+    assert len(both) == 5
     with pytest.raises(md.MorphError, match="begin with frames 0, 1"):
         next(iter(both))
 
@@ -386,31 +392,47 @@ def numbered(*numbers):
 
 
 @pytest.mark.parametrize(
-    ("cameras", "left_out"),
+    ("cameras", "missing"),
     [
-        ([(0, 1, 2, 3), (0, 2, 3)], {1}),
-        ([(0, 2, 3, 5, 6), (0, 1, 3, 4, 6), (0, 3, 6)], {1, 2, 4, 5}),
-        ([(0, 1, 2, 3, 4), (0, 2)], {1}),  # those after the end of the shortest do not count
+        ([(0, 1, 2, 3), (0, 2, 3)], [0, 1]),
+        ([(0, 2, 3, 5, 6), (0, 1, 3, 4, 6), (0, 3, 6)], [2, 2, 4]),
+        ([(0, 1, 2, 3, 4), (0, 2)], [0, 3]),  # one ends earlier
     ],
 )
-def test_frames_that_one_camera_lacks_are_left_out(cameras, left_out):
-    both = SynchronizedFrames([numbered(*numbers) for numbers in cameras])
-    common = sorted(set.intersection(*map(set, cameras)))
+def test_frames_that_one_camera_lacks_have_stand_ins(cameras, missing):
+    """By the clock of their camera: those of the others are 100 s ahead, and 200."""
+    recordings = [
+        [replace(frame, timestamp=frame.timestamp + 100.0 * k) for frame in numbered(*numbers)]
+        for k, numbers in enumerate(cameras)
+    ]
+    both = SynchronizedFrames(recordings)
     for _ in range(2):
-        assert [[frame.index for frame in frames] for frames in both] == [[n] * len(cameras) for n in common]
-        assert both.n_left_out == len(left_out)
+        instants = list(both)
+        assert [frames[0].index for frames in instants] == sorted(set().union(*cameras))
+        for k, numbers in enumerate(cameras):
+            times = [frames[k].timestamp for frames in instants]
+            np.testing.assert_allclose(times, [100.0 * k + frames[0].index / 30.0 for frames in instants])
+            stand_ins = [frames[k] for frames in instants if isinstance(frames[k], MissingFrame)]
+            assert {frame.index for frame in stand_ins} == set().union(*cameras) - set(numbers)
+            assert not any(frame.image.any() for frame in stand_ins)
+        assert both.n_missing == missing
 
 
-def test_a_frame_missing_in_one_camera_of_a_rig_leaves_a_gap(rig_recording_of_sheet, tmp_path, capsys):
+@pytest.mark.parametrize(("lacking", "number", "shown"), [("aside", 2, 5), ("front", 2, 4), ("front", 4, 4)])
+def test_a_frame_missing_in_one_camera_of_a_rig_is_tracked_with_the_other(
+    lacking, number, shown, model, rig_recording_of_sheet, tmp_path, capsys
+):
     folder = tmp_path / "rig"
     shutil.copytree(rig_recording_of_sheet, folder)
-    next((folder / "aside").glob("*2.png")).unlink()
+    next((folder / lacking).glob(f"*{number}.png")).unlink()
     assert run_command(with_both_cameras(folder, tmp_path / "run")) == 0
-    said = capsys.readouterr().out
-    assert "the cameras recorded 5, 4 frames: 4 were tracked, to the end of the shortest recording, without 1 " in said
+    camera, said = ("front", "aside").index(lacking), capsys.readouterr().out
+    assert f"have not recorded the same frames: of 5, camera {camera} lacks 1; there the others count" in said
     run = load_run(tmp_path / "run")
-    assert run.frames.tolist() == [0, 1, 3, 4]
-    assert len(md.open_source(tmp_path / "run" / "augmented.mp4")) == 4
+    assert run.frames.tolist() == [0, 1, 2, 3, 4]
+    assert set(run.status) == {"tracked"}
+    assert_follows_the_sheet(run, model)
+    assert len(md.open_source(tmp_path / "run" / "augmented.mp4")) == shown
 
 
 def test_an_object_out_of_the_picture_of_a_camera_of_a_rig_is_named(rig_recording_of_sheet, tmp_path, refused):

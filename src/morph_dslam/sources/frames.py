@@ -44,6 +44,10 @@ class Frame:
     captured: float | None = None
 
 
+class MissingFrame(Frame):
+    """Stands for the picture that a camera of a rig lacks of an instant, and others have; its image is black."""
+
+
 class FrameStream(Protocol):
     """Frames one after the other, recorded or live.
 

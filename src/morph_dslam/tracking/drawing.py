@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
@@ -358,7 +358,7 @@ MOST_STATES = 60
 
 
 def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults, view: AugmentedView) -> None:
-    """Draw every frame of the run; hidden and lost frames are shown as they are, with the reason."""
+    """Draw every frame of the run that the source has; hidden and lost ones are shown as they are, with the reason."""
     known = [state for state in run.states() if state is not None]
     limits = view.range_of(known[:: max(1, len(known) // MOST_STATES)])
     maps = camera.undistortion_maps()
@@ -372,9 +372,16 @@ def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults
             return with_caption(image, f"frame {frame.index}: {result.status}: {result.reason}")
         return view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps)
 
-    # Frames that may be missing after those of the run are read ahead, but never asked for.
-    numbers = set(run.frames)  # another camera may lack some
-    rows = zip(run.results, ahead(frame for frame in source if frame.index in numbers), strict=False)
+    results = dict(zip(run.frames, run.results, strict=True))
+
+    def rows() -> Iterator[tuple[FrameResult, Frame]]:
+        # Frames that may be missing after those of the run are read ahead, but never asked for.
+        for frame in ahead(iter(source)):
+            if frame.index in results:  # of a rig, either may lack some
+                yield results[frame.index], frame
+            if frame.index >= run.frames[-1]:
+                return
+
     with VideoWriter(path, source.fps, (camera.width, camera.height)) as video, threads_side_by_side():
-        for image in tqdm(ahead(starmap(drawn, rows)), total=len(run), desc="drawing", unit="frame"):
+        for image in tqdm(ahead(starmap(drawn, rows())), total=len(run), desc="drawing", unit="frame"):
             video.write(image)

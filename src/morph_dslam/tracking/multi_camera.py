@@ -21,6 +21,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
+from morph_dslam.sources.frames import MissingFrame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
@@ -375,7 +376,7 @@ class RigTracker:
 
     def track(
         self,
-        frames: Sequence[Frame | NDArray[np.uint8]],
+        frames: Sequence[Frame | NDArray[np.uint8] | None],
         localization: CameraLocalization | None = None,
         occluder_depths: Sequence[NDArray[np.float32]] | None = None,
     ) -> FrameResult:
@@ -383,7 +384,7 @@ class RigTracker:
 
         Parameters
         ----------
-        frames : by camera, or their images alone, as `Tracker.track` takes them.
+        frames : by camera, or their images alone, as `Tracker.track` takes them; None of a camera that has no picture.
         localization : the pose in the rig's frame by the map; None for a free object.
         occluder_depths : by camera, as in `Tracker.track`.
 
@@ -394,7 +395,11 @@ class RigTracker:
         """
         where = localization or CameraLocalization()
         known, results = where.pose_prior, []
+        time = next((frame.timestamp for frame in frames if isinstance(frame, Frame)), None)
         for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
+            if frame is None or isinstance(frame, MissingFrame):
+                results.append(tracker.pass_over(time if frame is None else frame.timestamp))
+                continue
             if isinstance(frame, Frame):
                 part.camera.checked_picture(frame.image, f"frame {frame.index} of camera {number}")
             seen = CameraLocalization(None if known is None else part.seen_pose(known))

@@ -55,6 +55,7 @@ class RejectionReason(StrEnum):
     TWO_PLACES = "it could be in two places, where {agreeing} and {points} points agree"
     CAMERAS_CONTRADICT = "the cameras contradict each other: is their calibration right?"
     NO_CAMERA = "no camera sees the object"
+    NO_PICTURE = "the camera has no picture"
 
 
 @dataclass(frozen=True)
@@ -252,6 +253,11 @@ class CameraIgnored(TrackingWarning):
     camera: int
     status: Status
     rejection: Rejection | None = None
+
+    @property
+    def has_no_picture(self) -> bool:
+        """Whether the camera has not recorded the frame."""
+        return self.rejection is not None and self.rejection.reason is RejectionReason.NO_PICTURE
 
     @property
     def text(self) -> str:

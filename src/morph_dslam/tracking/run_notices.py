@@ -106,8 +106,7 @@ class RunWarning(StrEnum):
         "object"
     )
     UNEQUAL_RECORDINGS = (
-        "the cameras recorded {counts} frames: {tracked} were tracked, to the end of the shortest recording, without "
-        "{left_out} that a camera has not recorded"
+        "the cameras have not recorded the same frames: of {instants}, {missing}; there the others count alone"
     )
 
 
@@ -178,7 +177,8 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
 
     tell(_warned(run, ObjectMoved), kind.MOVED)
     tell(_warned(run, CameraLost), kind.CAMERA_LOST)
-    ignored = _warned(run, CameraIgnored)
+    # Of pictures that were not recorded `SynchronizedFrames` tells.
+    ignored = [pair for pair in _warned(run, CameraIgnored) if not pair[1].has_no_picture]
     for number in sorted({warning.camera for _, warning in ignored}):
         tell(
             [(frame, warning) for frame, warning in ignored if warning.camera == number],

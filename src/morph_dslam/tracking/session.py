@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
+from itertools import islice
 
+import numpy as np
 from tqdm import tqdm
 
 from morph_dslam.errors import ArgumentError, SourceError, check_kind
 from morph_dslam.sources import Frame
-from morph_dslam.sources.frames import FrameSource, check_frame
+from morph_dslam.sources.frames import FrameSource, MissingFrame, check_frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
@@ -162,7 +164,7 @@ class Session:
 class SynchronizedFrames:
     """What several cameras recorded, the frames of one instant after the other.
 
-    A frame that one of them lacks is left out, and a gap stays in the numbers. It ends with the shortest recording.
+    Where some of them lack the frame of an instant, a `MissingFrame` stands for it. It ends with the longest recording.
 
     Parameters
     ----------
@@ -170,19 +172,20 @@ class SynchronizedFrames:
 
     Attributes
     ----------
-    n_left_out : number of instants in the last pass so far that a camera has no frame of.
+    n_instants : number of instants in the last pass so far.
+    n_missing : by camera, how many of these it has no frame of.
     """
 
     def __init__(self, sources: Sequence[FrameSource]) -> None:
-        self.sources, self.n_left_out = tuple(sources), 0
+        self.sources, self.n_instants, self.n_missing = tuple(sources), 0, [0] * len(sources)
 
-    def notices(self, n_tracked: int) -> list[RunNotice]:
+    def notices(self) -> list[RunNotice]:
         """What a reader must know if not all recordings have the same frames."""
-        counts = [len(source) for source in self.sources]
-        if len(set(counts)) == 1 and not self.n_left_out:
+        lacking = {number: count for number, count in enumerate(self.n_missing) if count}
+        if not lacking:
             return []
-        told = {"counts": ", ".join(map(str, counts)), "tracked": n_tracked, "left_out": self.n_left_out}
-        return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, **told)]
+        told = ", ".join(f"camera {number} lacks {count}" for number, count in lacking.items())
+        return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, instants=self.n_instants, missing=told)]
 
     @property
     def turned_deg(self) -> int:
@@ -200,28 +203,55 @@ class SynchronizedFrames:
         return getattr(self.sources[0], "has_registered_depth", False)
 
     def __len__(self) -> int:
-        """Number of instants at most."""
-        return min(len(source) for source in self.sources)
+        """Number of instants; there are more where no camera has all."""
+        return max(len(source) for source in self.sources)
 
     def __iter__(self) -> Iterator[tuple[Frame, ...]]:
         readers = [iter(source) for source in self.sources]
-        self.n_left_out = 0
-        first = True
-        for frames in zip(*readers, strict=False):
-            together, skipped = list(frames), set[int]()
-            if first:
-                _check_begin(together)
-            first = False
-            while len({frame.index for frame in together}) > 1:
-                newest = max(frame.index for frame in together)
-                behind = [k for k, frame in enumerate(together) if frame.index < newest]
-                skipped.update(together[k].index for k in behind)
-                for k in behind:
-                    if (frame := next(readers[k], None)) is None:
-                        return
-                    together[k] = frame
-            self.n_left_out += len(skipped)
-            yield tuple(together)
+        self.n_instants, self.n_missing = 0, [0] * len(readers)
+        come = [frame for reader in readers for frame in islice(reader, 1)]
+        if len(come) < len(readers):
+            return
+        _check_begin(come)
+        blank, clocks = [np.zeros_like(frame.image) for frame in come], _Clocks(come)
+        waiting: list[Frame | None] = [*come]
+        while any(frame is not None for frame in waiting):
+            number = min(frame.index for frame in waiting if frame is not None)
+            now = [frame if frame is not None and frame.index == number else None for frame in waiting]
+            times = clocks.times(now)
+            self.n_instants += 1
+            for k, frame in enumerate(now):
+                self.n_missing[k] += frame is None
+            stand_ins = [MissingFrame(number, time, image) for time, image in zip(times, blank, strict=True)]
+            yield tuple(stand_in if frame is None else frame for frame, stand_in in zip(now, stand_ins, strict=True))
+            waiting = [
+                old if new is None else next(reader, None)
+                for old, new, reader in zip(waiting, now, readers, strict=True)
+            ]
+
+
+class _Clocks:
+    """The times of an instant by the clock of each camera, also where it has no frame of it.
+
+    Parameters
+    ----------
+    frames : by camera, of one instant.
+    """
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._behind = [frame.timestamp - frames[0].timestamp for frame in frames]
+
+    def times(self, frames: Sequence[Frame | None]) -> list[float]:
+        """Seconds, by camera, of an instant of which at least one has a frame."""
+        seen = ((k, frame.timestamp) for k, frame in enumerate(frames) if frame is not None)
+        which, time = next(seen)
+        first = time - self._behind[which]
+        if which == 0:
+            self._behind = [
+                old if frame is None else frame.timestamp - first
+                for old, frame in zip(self._behind, frames, strict=True)
+            ]
+        return [first + behind for behind in self._behind]
 
 
 def _check_begin(frames: Sequence[Frame]) -> None:

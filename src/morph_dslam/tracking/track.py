@@ -350,7 +350,7 @@ class _Job:
         if part.options.use_discrepancy and part.model.stresses:
             notices.append(Remark(f"{NOT_IN_EQUILIBRIUM}; those in plots and tables are the model's without it"))
         if isinstance(self._source, SynchronizedFrames):
-            notices += self._source.notices(len(folder.results))
+            notices += self._source.notices()
         if run.live:
             facts["live"] = self._times.figures() | {"n_dropped": self._session.n_dropped}
             self._times.write(folder.path / "latency.csv")

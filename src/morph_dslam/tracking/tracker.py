@@ -42,7 +42,7 @@ from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import FoundBy, Rejection
+from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
 from morph_dslam.tracking.patches import LEVELS, follow, zero_where_unknown
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, first_view
 from morph_dslam.tracking.refinement import Keyframe
@@ -448,6 +448,22 @@ class Tracker:
         self._history.replace_last(state)
         if self._views is not None:
             self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
+
+    def pass_over(self, timestamp: float | None) -> FrameResult:
+        """Take in that the camera has no picture of an instant; the next frame is as after a loss.
+
+        Parameters
+        ----------
+        timestamp : of the instant, seconds; None if nobody tells it.
+        """
+        self._history.motion(timestamp)
+        self._history.add(None)
+        if timestamp is not None:
+            self._gaps.after_gap(timestamp)
+        self.last_measured, self._lost = self.reference.nothing_measured, True
+        self._n_lost += 1
+        rejection = Rejection(RejectionReason.NO_PICTURE)
+        return FrameResult(self.model, Status.LOST, rejection=rejection, timings_ms=dict.fromkeys(STAGES, 0.0))
 
     def _begin(self, image: Image) -> None:
         """Make the reference view."""
