@@ -332,6 +332,8 @@ class Camera:
     def check_image(self, image: NDArray, where: str) -> None:
         """Raise CameraError unless ``image`` (height, width, ...) has the calibrated size."""
         height, width = image.shape[:2]
+        if not image.size:
+            raise CameraError(f"{where} is {width}x{height} pixels: it holds no picture; give that of the camera")
         if (width, height) != (self.width, self.height):
             raise CameraError(
                 f"{where} is {width}x{height} pixels but the camera file is for {self.width}x{self.height}: "

@@ -88,7 +88,8 @@ def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, 
     assert process.returncode == INTERRUPTED
     assert "Traceback" not in message
     said = message.splitlines()[-1]
-    assert said == ("morph: interrupted; the solutions found so far are kept, and the same command goes on from there")
+    kept = "the solutions found so far, if any, are kept, and the same command goes on from there"
+    assert said == f"morph: interrupted; {kept}"
     wait_until(lambda: nothing_left(process.pid))
     assert 3 <= len(solved(output)) < N_SAMPLES
     assert main(["build", str(study), "-o", str(output)]) == 0

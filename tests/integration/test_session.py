@@ -10,7 +10,7 @@ import pytest
 import morph_dslam as md
 from morph_dslam.camera import Camera
 from morph_dslam.cli.app import main
-from morph_dslam.errors import RegistrationError
+from morph_dslam.errors import ArgumentError, RegistrationError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_rig
@@ -385,6 +385,11 @@ def test_frames_of_different_numbers_do_not_go_together(rig_recording_of_sheet):
     assert len(both) == 5
     with pytest.raises(md.MorphError, match="begin with frames 0, 1"):
         next(iter(both))
+
+
+def test_what_is_no_tracker_is_refused():
+    with pytest.raises(ArgumentError, match=r"trackers\['sheet'\] is 1: give a Tracker or a RigTracker"):
+        md.Session({"sheet": 1}, [])  # type: ignore[dict-item]
 
 
 def numbered(*numbers):

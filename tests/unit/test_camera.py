@@ -157,6 +157,8 @@ def test_the_camera_of_images_that_were_resized_is_told():
 
 def test_images_of_another_size_are_refused_by_name():
     PLAIN.check_image(np.zeros((480, 640, 3), np.uint8), "frame 7")
+    with pytest.raises(CameraError, match="frame 7 is 0x0 pixels: it holds no picture"):
+        PLAIN.check_image(np.zeros((0, 0), np.uint8), "frame 7")
     with pytest.raises(CameraError, match="frame 7 is 480x640 pixels but the camera file is for 640x480"):
         PLAIN.check_image(np.zeros((640, 480), np.uint8), "frame 7")
 

@@ -1,6 +1,7 @@
 """Images of ROS 1 and ROS 2 bags, which rosbags itself writes."""
 
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -116,6 +117,18 @@ def test_encodings(tmp_path, encoding):
     path = write_bag(tmp_path / "bag", 2, [("/image", message, START)])
     (frame,) = open_source(path)
     np.testing.assert_array_equal(frame.image, expected)
+
+
+@pytest.mark.parametrize("is_bigendian", [0, 1])
+def test_grey_of_16_bits_is_as_in_a_png(tmp_path, is_bigendian):
+    grey = (np.arange(24, dtype=np.uint16) * 2731).reshape(4, 6)
+    pixels = grey.astype(">u2" if is_bigendian else "<u2").view(np.uint8).reshape(4, 6, 2)
+    message = replace(image_message(ros_types(2), START, pixels, "mono16", padding=3), is_bigendian=is_bigendian)
+    (frame,) = open_source(write_bag(tmp_path / "bag", 2, [("/image", message, START)]))
+    cv2.imwrite(str(tmp_path / "grey.png"), grey)
+    expected = cv2.imread(str(tmp_path / "grey.png"), cv2.IMREAD_COLOR).astype(int)
+    assert np.abs(frame.image - expected).max() <= 1  # libraries round differently
+    assert frame.image.max() > 240
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])

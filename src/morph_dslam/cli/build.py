@@ -10,7 +10,7 @@ from morph_dslam.errors import StudyError
 HELP = "solve a study over its parameters and compress the solutions in a model file, or make one of a rigid surface"
 #: Ends of the names of surface files.
 SURFACES = (".stl", ".obj", ".ply")
-KEPT = "the solutions found so far are kept, and the same command goes on from there"
+KEPT = "the solutions found so far, if any, are kept, and the same command goes on from there"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

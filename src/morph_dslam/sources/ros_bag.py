@@ -29,6 +29,7 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bgra8": (4, cv2.COLOR_BGRA2BGR),
     "rgba8": (4, cv2.COLOR_RGBA2BGR),
     "mono8": (1, cv2.COLOR_GRAY2BGR),
+    "mono16": (2, cv2.COLOR_GRAY2BGR),
     "8UC1": (1, cv2.COLOR_GRAY2BGR),
     "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
     "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
@@ -144,6 +145,8 @@ def _decode(message: Any, what: str) -> NDArray[np.uint8]:
     # Rows may be padded.
     rows = np.frombuffer(message.data, dtype=np.uint8).reshape(message.height, message.step)
     pixels = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    if message.encoding == "mono16":  # the upper byte, as of images of 16 bits in files
+        pixels = pixels[:, :, :1] if message.is_bigendian else pixels[:, :, 1:]
     if conversion is None:
         return np.array(pixels)
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)

@@ -66,6 +66,8 @@ class Session:
         reregistration: Mapping[str, Reregistration] | None = None,
     ) -> None:
         check_kind(trackers, Mapping, "trackers", "a tracker of each object by its name, {'object': tracker}")
+        for name, tracker in trackers.items():
+            check_kind(tracker, (Tracker, RigTracker), f"trackers[{name!r}]", "a Tracker or a RigTracker")
         check_kind(source, Iterable, "source", "frames: a list of md.Frame, or what open_source returns")
         if not isinstance(sinks, Sequence) or not all(map(callable, sinks)):
             raise ArgumentError("sinks are a list of functions of a TrackedFrame, of one too: [results.append]")
