@@ -98,6 +98,26 @@ def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):
     assert (result.status, result.recovered) == ("tracked", False)
 
 
+def test_what_is_known_still_counts_after_frames_without_the_object(model, film):
+    """No point is seen in a black frame or under a full mask, and the sensor goes on all the while."""
+    tracker, sensor_std = start(model, film), 2e-4
+    for time in (0.02, 0.04):
+        tracker.track(film.frame(sheet_state(time)))
+    black, everywhere = np.zeros_like(film.blank()), np.ones(film.blank().shape[:2], dtype=bool)
+    for time, hidden in ((0.06, black), (0.10, None)):
+        tracker.know({"arch": (sheet_state(time).parameters[0], sensor_std)})
+        picture = film.frame(sheet_state(time)) if hidden is None else hidden
+        assert tracker.track(picture, occluder_depth=everywhere if hidden is None else None).status == "lost"
+        for later in (time + 0.01, time + 0.02):
+            truth = sheet_state(later)
+            tracker.know({"arch": (truth.parameters[0], sensor_std)})
+            result = tracker.track(film.frame(truth))
+            assert result.status == "tracked", result.reason
+            assert result.estimate.state.parameters[0] == pytest.approx(truth.parameters[0], abs=3.0 * sensor_std)
+            assert mean_error(model, result.estimate.state, truth) < 0.5e-3
+            assert result.estimate.parameter_std[0] < 1.5 * sensor_std
+
+
 def test_lens_distortion_is_undone(model):
     """Frames warped by a lens give the same states as ideal ones."""
     lens = Camera(640, 480, 528.0, 528.0, 320.0, 240.0, (-0.15, 0.05, 0.001, -0.001))

@@ -175,7 +175,7 @@ class FrameEstimation:
                 shift = motion.shift(self._reference.projected, start, measurement.recorded)
                 measurement = replace(measurement, pixels=measurement.recorded - shift)
             estimate = self._estimate(measurement, used, start, prior)
-            self._estimator.known.squared_px = max(estimate.sigma_px, LEAST_SIGMA_PX) ** 2
+            self._estimator.known.learn(estimate.sigma_px)
             limit = np.clip(self._options.inlier_sigmas * estimate.sigma_px, *self._options.inlier_px)
             with np.errstate(invalid="ignore"):
                 close = np.linalg.norm(estimate.residuals, axis=1) < limit

@@ -26,6 +26,8 @@ FRAME, STD = "frame", "_std_"
 FARTHEST = 3.0
 #: Without a deviation, a value is known to this part of its range.
 USUAL_STD = 0.005
+#: The least spread of residuals, pixels, that is believed when they are weighed against what is known.
+LEAST_SIGMA_PX = 0.1
 #: Values may lie outside of the range by this part of it: a sensor has noise, also where nothing acts.
 OUTSIDE = 0.02
 
@@ -202,6 +204,14 @@ class KnownParameters:
     def _set(self, indices: NDArray[np.int64], values: Array) -> None:
         there = np.isfinite(values[:, 0])
         self.indices, self._now = indices[: len(values)][there], values[there]
+
+    def learn(self, sigma_px: float) -> None:
+        """Take in how far an image coordinate is off in this frame, pixels; where no point is seen, nothing is learned.
+
+        The scale of frames before goes on then: an infinite one would make what is known infinitely certain.
+        """
+        if np.isfinite(sigma_px):
+            self.squared_px = max(sigma_px, LEAST_SIGMA_PX) ** 2
 
     def bounded(self, box: Box) -> Box:
         """The box with known parameters near their values: what a model cannot explain does not outweigh a sensor."""
