@@ -21,6 +21,7 @@ from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
+from morph_dslam.tracking.outcomes import RejectionReason, SamePlace
 from morph_dslam.tracking.session import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
@@ -126,6 +127,47 @@ def test_a_lost_object_occludes_nothing(model, films):
     results = objects.track([Frame(0, 0.0, films["behind"].frame(states(TIMES[14])["behind"]))])
     assert results["before"].status is md.Status.LOST
     assert results["behind"].n_points > before["behind"].n_points + 80
+
+
+def twins(places, film, model):
+    """One picture of sheets with the same print at places (3,), the nearer ones before the others."""
+    shown = film.blank()
+    for place in sorted(places, key=lambda place: -place[2]):
+        state = twin_state(place)
+        covered = sheet_depth(model, state, np.random.default_rng(0), 0.0, 9.0) < 9.0
+        shown = np.where(covered[:, :, None], film.frame(state), shown)
+    return shown
+
+
+def twin_state(place):
+    return State(np.array([0.02, 0.1, 0.0]), RigidTransform(UPRIGHT, np.array(place)))
+
+
+def test_a_twin_that_leaves_the_picture_is_not_found_where_the_other_one_stands(model):
+    """Two sheets alike: one leaves, is lost as long as it is away, and comes back elsewhere."""
+    film, left, right, back = SheetFilm(model, seed=1), [-0.25, 0.0, 1.2], [0.2, 0.0, 1.2], [-0.2, 0.08, 1.2]
+    film_of = {"left": left, "right": right}
+    trackers = {name: Tracker(model, CAMERA, Registration(model, twin_state(at))) for name, at in film_of.items()}
+    objects = MultiObjectTracker(trackers)
+    placed = [[left, right]] * 2 + [[right]] * 2 + [[back, right]] * 2
+    for number, places in enumerate(placed):
+        results = objects.track([Frame(number, number / 30, twins(places, film, model))])
+        assert mean_error(model, results["right"].estimate.state, twin_state(right)) < 0.5e-3
+        if len(places) == 1:
+            assert results["left"].status is md.Status.LOST
+            assert results["left"].rejection.then.reason is RejectionReason.PLACE_TAKEN
+        else:
+            assert mean_error(model, results["left"].estimate.state, twin_state(places[0])) < 1e-3
+        assert not any(result.warning(SamePlace) for result in results.values())
+
+
+def test_two_objects_in_one_place_are_both_named(model):
+    """Landmarks of one of two that look alike were given to both."""
+    film, place = SheetFilm(model, seed=1), [0.0, 0.0, 0.9]
+    trackers = {name: Tracker(model, CAMERA, Registration(model, twin_state(place))) for name in ("one", "other")}
+    results = MultiObjectTracker(trackers).track([Frame(0, 0.0, film.frame(twin_state(place)))])
+    assert results["one"].warning(SamePlace) == SamePlace("other")
+    assert results["other"].warning(SamePlace) == SamePlace("one")
 
 
 @pytest.fixture(scope="module")

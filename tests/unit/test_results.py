@@ -26,6 +26,7 @@ from morph_dslam.tracking.outcomes import (
     OtherReferenceView,
     Rejection,
     RejectionReason,
+    SamePlace,
     Status,
 )
 from morph_dslam.tracking.result import STAGES, FrameResult
@@ -144,6 +145,7 @@ def test_summary_counts_and_flags():
 PER_FRAME = [
     (ObjectMoved(), RunWarning.MOVED),
     (FewPointsAgree(0.5), RunWarning.FEW_AGREE),
+    (SamePlace("twin"), RunWarning.SAME_PLACE),
     (ModelDoesNotExplain(0.7), RunWarning.MODEL_FAILS),
     (CamerasDisagree(0.7), RunWarning.CAMERAS_DISAGREE),
     (CameraLost("too few points"), RunWarning.CAMERA_LOST),

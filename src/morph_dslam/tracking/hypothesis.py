@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +19,7 @@ from morph_dslam.tracking.outcomes import DepthNotUsed, Rejection, RejectionReas
 from morph_dslam.tracking.outline import OutlineMeasurement
 from morph_dslam.tracking.outline_weight import MEDIAN_OF_NUMBER
 from morph_dslam.tracking.row_motion import RowMotion
+from morph_dslam.tracking.state import State
 
 #: Where less than this share of all points agree, they must agree closely.
 MOST_AGREE = 0.5
@@ -40,6 +42,7 @@ class Image:
     depth : (h, w) of a depth camera, as recorded, metres, NaN where unknown; None without one.
     occluder_depth : (h, w) of other objects, metres, infinite where there are none; None if none is known.
     motion : of the object while a rolling shutter recorded the frame; None where it is not known, or of a global one.
+    is_taken : whether another object stands where this one would stand in a state; None where no other is known.
     """
 
     grey: NDArray[np.uint8]
@@ -47,6 +50,7 @@ class Image:
     depth: NDArray[np.float32] | None = None
     occluder_depth: NDArray[np.float32] | None = None
     motion: RowMotion | None = None
+    is_taken: Callable[[State], bool] | None = None
 
     @cached_property
     def half(self) -> NDArray[np.uint8]:

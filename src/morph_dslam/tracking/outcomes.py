@@ -53,6 +53,7 @@ class RejectionReason(StrEnum):
     FEW_FEATURES = "only {agreeing} features of the reference view were found again"
     PART_ABSENT = "a part is missing: {agreeing} of {points} points of the outline show what is beside the object"
     TWO_PLACES = "it could be in two places, where {agreeing} and {points} points agree"
+    PLACE_TAKEN = "where it seems to be, with {agreeing} of {points} points, another object stands that looks like it"
     CAMERAS_CONTRADICT = "the cameras contradict each other: is their calibration right?"
     NO_CAMERA = "no camera sees the object"
     NO_PICTURE = "the camera has no picture"
@@ -116,6 +117,19 @@ class FewPointsAgree(TrackingWarning):
 
     template: ClassVar[str] = "few points agree, and less closely than usual: by {spread_px:.1f} px"
     spread_px: float
+
+
+@dataclass(frozen=True)
+class SamePlace(TrackingWarning):
+    """Two objects of a session stand in one place, which bodies cannot: one of them was taken for the other.
+
+    Attributes
+    ----------
+    other : name of the other object.
+    """
+
+    template: ClassVar[str] = "it stands where '{other}' stands: one of both was taken for the other"
+    other: str
 
 
 @dataclass(frozen=True)

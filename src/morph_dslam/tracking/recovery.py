@@ -39,6 +39,8 @@ MOST_SHAPES = 27
 ALIKE_TO_USUAL = 5.0
 #: So many times a better place is looked for from a better one.
 MOST_ROUNDS = 3
+#: In so many places where other objects stand it is found before it counts as lost.
+MOST_TAKEN = 4
 #: So many standard deviations tell two places apart.
 SIGNIFICANT = 3.0
 #: Share of the latest frame in the usual spread.
@@ -130,7 +132,10 @@ class Recovery:
         A regular print that is shifted by a period agrees nearly everywhere.
         """
         if attempt.prior is not None or reject(attempt, self._options) is not None or attempt.outline_alone:
-            return attempt, self.reject(attempt, followed=False)
+            rejection = self.reject(attempt, followed=False)
+            if rejection is None and attempt.prior is None and _is_taken(picture, attempt):
+                rejection = _taken(attempt)
+            return attempt, rejection
         best, rejection = attempt, None
         # A better place comes with a better shape, from which the right one may be in reach.
         for _ in range(MOST_ROUNDS):
@@ -138,7 +143,10 @@ class Recovery:
             shifts = self._shifts(picture, attempt.estimate.state)
             shifts = shifts[np.linalg.norm(shifts, axis=1) >= LARGEST_CORRECTION_PX]
             places = [attempt, *self._shifted(picture, attempt.estimate.state, shifts)]
-            best, rejection = self._chosen(places, alike=len(shifts) > 0)
+            free = [place for place in places if not _is_taken(picture, place)]
+            if not free:
+                return attempt, _taken(attempt)
+            best, rejection = self._chosen(free, alike=len(shifts) > 0)
             if best is attempt:
                 break
         return best, rejection
@@ -194,9 +202,9 @@ class Recovery:
         """
         found = None if held is not None else self._by_appearance(picture, last)
         if found is None:
-            found, matches = self._find(picture, self._shapes(last.parameters), None, held)
-            if matches is not None:
-                return None, replace(rejection, then=Rejection(RejectionReason.FEW_FEATURES, matches))
+            found, why = self._find_free(picture, self._shapes(last.parameters), held)
+            if why is not None:
+                return None, replace(rejection, then=why)
             if found is not None and held is None:
                 found, mistaken = self.unmistaken(picture, found)
                 if mistaken is not None:
@@ -220,19 +228,36 @@ class Recovery:
         self._n_doubted = self._n_doubted + 1 if doubted else 0
         if not doubted or (self._n_doubted - 1) % self._options.look_every:
             return None
-        found, _ = self._find(picture, self._shapes(last_shape), None)
+        found, _ = self._find_free(picture, self._shapes(last_shape), None)
         if found is None or not agree(found, MOST_AGREE) or found.estimate.sigma_px >= followed.estimate.sigma_px:
             return None
         return found if self.another(picture, found) is None else None
 
     def another(self, picture: Image, found: PoseHypothesis) -> PoseHypothesis | None:
         """Another one like the object that was found, elsewhere in the frame; None if there is none."""
-        with stage("recover"):
-            covered = self._reference.covered(found.estimate.state)
-            elsewhere = np.where(covered, 0, 255).astype(np.uint8)
         shapes = [found.estimate.state.parameters, self._model.default]  # it may rest
-        other, _ = self._find(picture, shapes, elsewhere)
+        other, _ = self._find_free(picture, shapes, None, self._elsewhere(found, None))
         return other if other is not None and self._apart(found, other) else None
+
+    def _elsewhere(self, found: PoseHypothesis, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        """Where (h, w) to look, 255, but for the place that was found; 0 where ``mask`` is."""
+        with stage("recover"):
+            elsewhere = np.where(self._reference.covered(found.estimate.state), 0, 255).astype(np.uint8)
+        return elsewhere if mask is None else np.minimum(elsewhere, mask)
+
+    def _find_free(
+        self, picture: Image, shapes: list[Array], held: Prior | None, mask: NDArray[np.uint8] | None = None
+    ) -> tuple[PoseHypothesis | None, Rejection | None]:
+        """A place where the object is to be believed and no other one stands; or None, and why, if it is known."""
+        taken: Rejection | None = None
+        for _ in range(MOST_TAKEN):
+            found, matches = self._find(picture, shapes, mask, held)
+            if found is None:
+                return None, taken if matches is None or taken else Rejection(RejectionReason.FEW_FEATURES, matches)
+            if held is not None or not _is_taken(picture, found):
+                return found, None
+            taken, mask = _taken(found), self._elsewhere(found, mask)
+        return None, taken
 
     def _find(
         self, picture: Image, shapes: list[Array], mask: NDArray[np.uint8] | None, held: Prior | None = None
@@ -247,8 +272,12 @@ class Recovery:
     def _by_appearance(self, picture: Image, last: State) -> PoseHypothesis | None:
         """The object in the place that looks most like it in its last state; None if it is not to be believed."""
         places = self._shifted(picture, last, self._shifts(picture, last))
+        places = [place for place in places if not _is_taken(picture, place)]
         best, rejection = self._chosen(places, alike=True) if places else (None, None)
-        return None if best is None or rejection is not None else self._settled(picture, best.estimate.state, None)
+        if best is None or rejection is not None:
+            return None
+        found = self._settled(picture, best.estimate.state, None)
+        return None if found is None or _is_taken(picture, found) else found
 
     def _settled(self, picture: Image, state: State, held: Prior | None) -> PoseHypothesis | None:
         """The object near ``state``, in the shape that explains the frame best; None if it is not to be believed."""
@@ -289,3 +318,14 @@ class Recovery:
                 shape[k] = lower[k] + share * (upper[k] - lower[k])
                 shapes.append(shape)
         return shapes
+
+
+def _is_taken(picture: Image, place: PoseHypothesis) -> bool:
+    """Whether another object stands there."""
+    return picture.is_taken is not None and picture.is_taken(place.estimate.state)
+
+
+def _taken(place: PoseHypothesis) -> Rejection:
+    """Why a place where another object stands is not accepted."""
+    points, agreeing = place.counts
+    return Rejection(RejectionReason.PLACE_TAKEN, agreeing, points)

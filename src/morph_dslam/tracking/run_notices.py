@@ -23,6 +23,7 @@ from morph_dslam.tracking.outcomes import (
     ModelDoesNotExplain,
     ObjectMoved,
     ReadoutNotUsed,
+    SamePlace,
     Status,
     TrackingWarning,
 )
@@ -51,6 +52,10 @@ class RunWarning(StrEnum):
     FEW_AGREE = (
         "few points agree, and less closely than usual, in {count} of {n_frames} frames, first in frame {first}: "
         "something is before the object, or it was taken for what looks like it; do not rely on these frames"
+    )
+    SAME_PLACE = (
+        "it stands where '{other}' stands in {count} of {n_frames} frames, first in frame {first}: one of both was "
+        "taken for the other, which looks like it; do not rely on these frames of either"
     )
     MODEL_FAILS = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
@@ -190,6 +195,9 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     if 2 * len(without_rows) > len(run):
         tell(without_rows, kind.READOUT_NOT_USED)
     tell(_warned(run, FewPointsAgree), kind.FEW_AGREE)
+    same = _warned(run, SamePlace)
+    for other in sorted({warning.other for _, warning in same}):
+        tell([(frame, w) for frame, w in same if w.other == other], kind.SAME_PLACE, other=other)
     largest = float(np.nanmax(run.unexplained_px(), initial=0.0))
     fails = kind.MODEL_FAILS if run.model.parameters else kind.RIGID_FAILS
     tell(_warned(run, ModelDoesNotExplain), fails, largest_px=largest)

@@ -7,7 +7,7 @@ changes: the previous frames only say where to start.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,6 +118,8 @@ class Tracker:
     state : last known of the object.
     last_seen : where the first view's points were in the last frame that was compared with it.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
+    is_taken : whether another object stands where this one would stand in a state, in the frame of the camera: there it
+        is not found again after a loss. A `Session` of several objects sets it; None where no other is known.
 
     Raises
     ------
@@ -163,6 +165,7 @@ class Tracker:
         self._still: Prior | None = None
         if registration.scene is not None and reference is None:
             reference, in_sequence = self._from_scene(), False
+        self.is_taken: Callable[[State], bool] | None = None
         self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
         self._history = StateHistory(camera, self.model.nodes.mean(axis=0))
         self.last_seen: Keyframe | None = None
@@ -269,7 +272,7 @@ class Tracker:
             motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
             image = ready or picture.made_ready(self._undistortion)
             occluders = occluders_of(occluder_depth, self.camera, self._undistortion)
-            image = replace(image, depth=picture.depth, occluder_depth=occluders, motion=motion)
+            image = replace(image, depth=picture.depth, occluder_depth=occluders, motion=motion, is_taken=self.is_taken)
             if self._views is None:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
