@@ -15,7 +15,7 @@ from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import DepthNotUsed, RejectionReason
+from morph_dslam.tracking.outcomes import DepthNotUsed, KnownRefuted, RejectionReason
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.tracker import Tracker
@@ -116,6 +116,25 @@ def test_what_is_known_still_counts_after_frames_without_the_object(model, film)
             assert result.estimate.state.parameters[0] == pytest.approx(truth.parameters[0], abs=3.0 * sensor_std)
             assert mean_error(model, result.estimate.state, truth) < 0.5e-3
             assert result.estimate.parameter_std[0] < 1.5 * sensor_std
+
+
+@pytest.mark.parametrize("sensor_std", [2e-3, 2e-5])
+def test_a_sensor_that_the_images_refute_is_named_and_a_right_one_is_not(model, film, sensor_std):
+    """Its readings are right at first, with noise of the stated size, and have another zero later."""
+    tracker, random, refuted = start(model, film), np.random.default_rng(2), []
+    for number, time in enumerate(np.linspace(0.0, 0.4, 25)[1:]):
+        truth, zero = sheet_state(time).parameters[0], 0.015 if number >= 16 else 0.0
+        tracker.know({"arch": (truth + zero + sensor_std * random.standard_normal(), sensor_std)})
+        result = tracker.track(film.frame(sheet_state(time)))
+        assert result.tracked, result.reason
+        found = [warning for warning in result.warnings if isinstance(warning, KnownRefuted)]
+        refuted.append(len(found))
+        for warning in found:
+            assert (warning.parameter, warning.deviations > 4.0) == ("arch", True)
+            assert float(warning.found.removesuffix(" mm")) == pytest.approx(1e3 * truth, abs=1.0)
+    assert refuted == [0] * 16 + [1] * 8
+    # The blame for what the sensor does not fit is not laid on the registration.
+    assert result.reference_factor == pytest.approx(1.0, abs=0.1)
 
 
 def test_lens_distortion_is_undone(model):

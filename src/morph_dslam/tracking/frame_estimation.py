@@ -18,6 +18,7 @@ from morph_dslam.tracking.covariance import trace_of_share
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
+from morph_dslam.tracking.known_values import LEAST_SIGMA_PX, KnownParameters
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
 from morph_dslam.tracking.noise import (
     Correlation,
@@ -47,8 +48,6 @@ REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
 CLEARLY_BETTER = 0.95
 #: Other shapes are tried on at least so many points, where there are as many, and at most twice as many.
 SCOUTED = 80
-#: The least spread of residuals, pixels, that is believed when they are weighed against depths.
-LEAST_SIGMA_PX = 0.1
 #: Depths this many times as far as the points have the object are in another unit, or of another camera.
 MOST_TIMES = 1.5
 #: A start off a bound is this share of the range inside of it.
@@ -147,6 +146,15 @@ class FrameEstimation:
         if self._study_scout is not None:
             self._study_scout.known = estimator.known
         self._last_joined: tuple[BoundPoints, BoundPoints] | None = None
+
+    @property
+    def known(self) -> KnownParameters:
+        """What is known of parameters in the present frame."""
+        return self._estimator.known
+
+    def fitted(self, attempt: PoseHypothesis) -> Estimate:
+        """The estimate from an attempt's measurements and what is known of parameters now."""
+        return self._estimator.fit(self.measured(attempt, correlated=False), attempt.estimate.state, attempt.prior)
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""

@@ -14,6 +14,7 @@ from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, largest_jump
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.hypothesis import PoseHypothesis
+from morph_dslam.tracking.known_check import refuted_values
 from morph_dslam.tracking.outcomes import (
     CameraLost,
     FewPointsAgree,
@@ -91,6 +92,7 @@ def tracked_result(
     view: ActiveView,
     past: SequenceFilter,
     warnings: Sequence[TrackingWarning],
+    errors: ModelErrors | None = None,
 ) -> FrameResult:
     """The result of a frame with an accepted hypothesis.
 
@@ -101,8 +103,9 @@ def tracked_result(
     view : that the frame was compared with.
     past : what earlier frames tell.
     warnings : of where the object is.
+    errors : of the model's mesh and reduction; None where none are known.
     """
-    estimate, unexplained_px, more = _with_systematic_errors(hypothesis, view, past)
+    estimate, unexplained_px, more = _with_systematic_errors(hypothesis, view, past, errors)
     if hypothesis.depth_unused is not None:
         more.append(hypothesis.depth_unused)
     residuals, (n_points, n_inliers) = hypothesis.estimate.residuals[hypothesis.supporting], hypothesis.counts
@@ -122,7 +125,7 @@ def tracked_result(
 
 
 def _with_systematic_errors(
-    hypothesis: PoseHypothesis, view: ActiveView, past: SequenceFilter
+    hypothesis: PoseHypothesis, view: ActiveView, past: SequenceFilter, errors: ModelErrors | None
 ) -> tuple[Estimate, float, list[TrackingWarning]]:
     """The estimate with errors that do not average out in its covariance, and what that says of it."""
     systematic, recovery = view.systematic, view.recovery
@@ -132,8 +135,10 @@ def _with_systematic_errors(
     left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
     doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
     common_px, known = max(left.px, doubt_px), (past.past_information, past.keeps)
+    refuted = refuted_values(hypothesis, view.estimation, systematic, errors, doubt_px, whole)
+    whole = whole and not len(view.estimation.known.indices)  # learned from the images alone then
     estimate = systematic.added(hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole, *known)
-    warnings: list[TrackingWarning] = []
+    warnings: list[TrackingWarning] = [*refuted]
     if doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
     if left.is_failure:

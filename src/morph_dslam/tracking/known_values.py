@@ -6,7 +6,8 @@ found from images, which may then tell of other things: a force at the tip of a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
@@ -26,7 +27,7 @@ FRAME, STD = "frame", "_std_"
 FARTHEST = 3.0
 #: Without a deviation, a value is known to this part of its range.
 USUAL_STD = 0.005
-#: The least spread of residuals, pixels, that is believed when they are weighed against what is known.
+#: The least spread of residuals, pixels, that is believed when they are weighed against what is known, or depths.
 LEAST_SIGMA_PX = 0.1
 #: Values may lie outside of the range by this part of it: a sensor has noise, also where nothing acts.
 OUTSIDE = 0.02
@@ -165,14 +166,16 @@ class KnownParameters:
     Attributes
     ----------
     values : of a recording; None where there are none.
+    model : whose parameters they are.
     indices : of the parameters (k,) that are known in the present frame.
+    now : their values and standard deviations (k, 2), SI.
     squared_px : variance of an image coordinate, which turns likelihoods into costs in squared pixels.
     """
 
     def __init__(self, model: ReducedModel) -> None:
-        self._model, self.squared_px = model, 0.25
+        self.model, self.squared_px = model, 0.25
         self.values: KnownValues | None = None
-        self.indices, self._now = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.indices, self.now = np.empty(0, dtype=np.int64), np.empty((0, 2))
 
     def begin(self, frame: int | None) -> None:
         """A frame of this number begins: its values of the recording's table count, if there is one."""
@@ -192,18 +195,18 @@ class KnownParameters:
             If a value is no finite number in SI, or that with its deviation.
         """
         check_kind(known, Mapping, "what is known", "values by the parameter's name, {'pressure': 2e3}")
-        names = [parameter.name for parameter in self._model.study_parameters]
+        names = [parameter.name for parameter in self.model.study_parameters]
         if wrong := [name for name in known if name not in names]:
             raise TrackingError(f"'{wrong[0]}' is not a parameter of the model: these are {', '.join(names) or 'none'}")
         values = np.array([_told(name, value) for name, value in known.items()], dtype=np.float64).reshape(-1, 2)
         indices = np.array([names.index(name) for name in known], dtype=np.int64)
         for k, (value, deviation) in zip(indices.tolist(), values, strict=True):
-            check_known("known parameters", self._model, k, value, deviation)
-        self._set(indices, with_usual_deviations(self._model, indices, values))
+            check_known("known parameters", self.model, k, value, deviation)
+        self._set(indices, with_usual_deviations(self.model, indices, values))
 
     def _set(self, indices: NDArray[np.int64], values: Array) -> None:
         there = np.isfinite(values[:, 0])
-        self.indices, self._now = indices[: len(values)][there], values[there]
+        self.indices, self.now = indices[: len(values)][there], values[there]
 
     def learn(self, sigma_px: float) -> None:
         """Take in how far an image coordinate is off in this frame, pixels; where no point is seen, nothing is learned.
@@ -213,11 +216,21 @@ class KnownParameters:
         if np.isfinite(sigma_px):
             self.squared_px = max(sigma_px, LEAST_SIGMA_PX) ** 2
 
+    @contextmanager
+    def set_aside(self) -> Iterator[None]:
+        """Meanwhile nothing is known: what do the images say alone?"""
+        indices, now = self.indices, self.now
+        self.indices, self.now = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        try:
+            yield
+        finally:
+            self.indices, self.now = indices, now
+
     def bounded(self, box: Box) -> Box:
         """The box with known parameters near their values: what a model cannot explain does not outweigh a sensor."""
         if not len(self.indices):
             return box
-        lower, upper, (value, deviation) = box.lower.copy(), box.upper.copy(), self._now.T
+        lower, upper, (value, deviation) = box.lower.copy(), box.upper.copy(), self.now.T
         rows, most = self.indices, FARTHEST * deviation
         lower[rows] = np.clip(value - most, box.lower[rows], box.upper[rows])
         upper[rows] = np.clip(value + most, box.lower[rows], box.upper[rows])
@@ -225,8 +238,8 @@ class KnownParameters:
 
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, and its Hessian's diagonal (k,) and gradient (k,) at parameters (n,); in squared pixels."""
-        information = self.squared_px / self._now[:, 1] ** 2
-        away = parameters[self.indices] - self._now[:, 0]
+        information = self.squared_px / self.now[:, 1] ** 2
+        away = parameters[self.indices] - self.now[:, 0]
         return 0.5 * float(information @ away**2), information, information * away
 
 

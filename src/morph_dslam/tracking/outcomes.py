@@ -185,6 +185,25 @@ class ReferenceWidened(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class KnownRefuted(TrackingWarning):
+    """The images alone have a known parameter elsewhere, by far: the sensor's zero, unit, clock or deviation is wrong.
+
+    Attributes
+    ----------
+    parameter : its name.
+    known : what is known of it, with its unit.
+    found : what the images alone give, with its unit.
+    deviations : by how many standard deviations of both together these differ.
+    """
+
+    template: ClassVar[str] = "the images refute the known {parameter} = {known}: alone they give {found}"
+    parameter: str
+    known: str
+    found: str
+    deviations: float
+
+
+@dataclass(frozen=True)
 class OtherReferenceView(TrackingWarning):
     """The frame was compared with another reference view than the first.
 

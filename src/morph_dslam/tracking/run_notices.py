@@ -20,6 +20,7 @@ from morph_dslam.tracking.outcomes import (
     CamerasDisagree,
     DepthNotUsed,
     FewPointsAgree,
+    KnownRefuted,
     ModelDoesNotExplain,
     ObjectMoved,
     ReadoutNotUsed,
@@ -56,6 +57,11 @@ class RunWarning(StrEnum):
     SAME_PLACE = (
         "it stands where '{other}' stands in {count} of {n_frames} frames, first in frame {first}: one of both was "
         "taken for the other, which looks like it; do not rely on these frames of either"
+    )
+    KNOWN_REFUTED = (
+        "the images refute the known values of '{parameter}' in {count} of {n_frames} frames, first in frame {first}, "
+        "by up to {largest:.0f} standard deviations: check the sensor's zero, its unit, its clock and its deviation, "
+        "and the registration; estimates there hold to the sensor, and what it does not fit is left in the images"
     )
     MODEL_FAILS = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
@@ -198,6 +204,11 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     same = _warned(run, SamePlace)
     for other in sorted({warning.other for _, warning in same}):
         tell([(frame, w) for frame, w in same if w.other == other], kind.SAME_PLACE, other=other)
+    refuted = _warned(run, KnownRefuted)
+    for name in dict.fromkeys(warning.parameter for _, warning in refuted):
+        of_one = [(frame, warning) for frame, warning in refuted if warning.parameter == name]
+        largest = max(warning.deviations for _, warning in of_one)
+        tell(of_one, kind.KNOWN_REFUTED, parameter=name, largest=largest)
     largest = float(np.nanmax(run.unexplained_px(), initial=0.0))
     fails = kind.MODEL_FAILS if run.model.parameters else kind.RIGID_FAILS
     tell(_warned(run, ModelDoesNotExplain), fails, largest_px=largest)

@@ -412,7 +412,8 @@ class Tracker:
             placed = self._placed_by_map(camera)
             result = lost_result(self.model, hypothesis, rejection, placed, warnings)
         else:
-            result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings)
+            errors = self._model_errors
+            result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings, errors)
             is_still = self.options.pose == "still"
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
         return replace(result, view=number, motion=self._image.motion, modulus_std=self.options.modulus_std)
