@@ -29,6 +29,7 @@ from morph_dslam.tracking.outcomes import (
     RejectionReason,
     SamePlace,
     Status,
+    TimeOutside,
 )
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_folder import summarise
@@ -147,6 +148,7 @@ PER_FRAME = [
     (ObjectMoved(), RunWarning.MOVED),
     (FewPointsAgree(0.5), RunWarning.FEW_AGREE),
     (SamePlace("twin"), RunWarning.SAME_PLACE),
+    (TimeOutside("hold", "21 s", "0 to 20 s"), RunWarning.TIME_OUTSIDE),
     (KnownRefuted("arch", "3 mm", "5 mm", 7.0), RunWarning.KNOWN_REFUTED),
     (ModelDoesNotExplain(0.7), RunWarning.MODEL_FAILS),
     (CamerasDisagree(0.7), RunWarning.CAMERAS_DISAGREE),

@@ -256,6 +256,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         inner=tuple(arguments.inner),
         points=tuple(arguments.point),
         known=getattr(arguments, "known", None),
+        time_zero=arguments.time_zero,
         reregister_at=frames_of(""),
         tracker=replace(
             tracker,

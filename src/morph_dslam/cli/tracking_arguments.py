@@ -111,6 +111,13 @@ def _add_measured(group: _Group) -> None:
         "--discrepancy",
         "look for what the object's shape has beyond the model's: small smooth displacements that hardly stretch it",
     )
+    group.add_argument(
+        "--time-zero",
+        type=float,
+        metavar="SECONDS",
+        help="time of the recording, as in frames.csv, at which the model's time begins: its parameter of time is then "
+        "known in every frame (default: it is unknown like others)",
+    )
     add_repeated(
         group,
         "--random-walk",

@@ -126,6 +126,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "program tells the tracker (Tracker.know)",
     ),
     (
+        lambda run: any(part.time_zero is not None for part in run.objects) and bool(run.other_cameras),
+        "the model's time is known by the frames of one camera: leave out --time-zero or --with",
+    ),
+    (
         lambda run: run.refine_reference and bool(run.other_cameras),
         "the reference is refined for one camera: leave out --refine or --with",
     ),
@@ -186,6 +190,16 @@ def check_depth(run: TrackOptions, objects: Sequence[TrackedObject], source: obj
         raise TrackingError(
             f"{run.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
             "track it without --depth"
+        )
+
+
+def check_times(run: TrackOptions, source: object) -> None:
+    """Raise TrackingError if the model's time is to be known by frames that have no times."""
+    is_asked = any(part.time_zero is not None for part in run.objects)
+    if is_asked and run.fps is None and getattr(source, "has_assumed_times", False):
+        raise TrackingError(
+            f"--time-zero: nothing tells the times of the frames of {run.frames}: name the images by their times, or "
+            "give --fps"
         )
 
 

@@ -19,7 +19,9 @@ from morph_dslam.errors import ArgumentError, TrackingError, check_kind
 from morph_dslam.io.text import has_a_cell_for_each, read_csv
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
+from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.levenberg_marquardt import Box
+from morph_dslam.tracking.outcomes import TimeOutside
 
 Array = NDArray[np.float64]
 FRAME, STD = "frame", "_std_"
@@ -166,6 +168,8 @@ class KnownParameters:
     Attributes
     ----------
     values : of a recording; None where there are none.
+    clock : the parameter that is known by the frames' times; None where none is.
+    warnings : of the present frame.
     model : whose parameters they are.
     indices : of the parameters (k,) that are known in the present frame.
     now : their values and standard deviations (k, 2), SI.
@@ -175,14 +179,26 @@ class KnownParameters:
     def __init__(self, model: ReducedModel) -> None:
         self.model, self.squared_px = model, 0.25
         self.values: KnownValues | None = None
+        self.clock: KnownTime | None = None
+        self.warnings: tuple[TimeOutside, ...] = ()
         self.indices, self.now = np.empty(0, dtype=np.int64), np.empty((0, 2))
 
-    def begin(self, frame: int | None) -> None:
-        """A frame of this number begins: its values of the recording's table count, if there is one."""
-        if self.values is None:
+    def begin(self, frame: int | None, timestamp: float | None = None) -> None:
+        """A frame of this number and time, seconds, begins: what the recording's table, or the time, says counts."""
+        self.warnings = ()
+        if self.values is None and self.clock is None:
             return
-        now = self.values.by_frame.get(-1 if frame is None else frame)
-        self._set(self.values.indices, np.empty((0, 2)) if now is None else now)
+        now, indices = np.empty((0, 2)), np.empty(0, dtype=np.int64)
+        if self.values is not None:
+            now = self.values.by_frame.get(-1 if frame is None else frame, now)
+            indices = self.values.indices[: len(now)]
+        if self.clock is not None and timestamp is not None:
+            time = self.clock.at(timestamp)
+            if isinstance(time, TimeOutside):
+                self.warnings = (time,)
+            else:
+                now, indices = np.vstack([now, time]), np.append(indices, self.clock.index)
+        self._set(indices, now)
 
     def tell(self, known: Mapping[str, float | tuple[float, float]]) -> None:
         """Values, SI, by parameter, each perhaps with its standard deviation, from now on; none with an empty mapping.

@@ -204,6 +204,25 @@ class KnownRefuted(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class TimeOutside(TrackingWarning):
+    """A frame is before the instant at which the model's time begins, or after the end of its range: it is not known.
+
+    Attributes
+    ----------
+    parameter : that measures time.
+    time : of the frame, with its unit.
+    range : of the parameter, with its unit.
+    """
+
+    template: ClassVar[str] = (
+        "{parameter} is {time} here, outside of the model's range from {range}: it counts as unknown"
+    )
+    parameter: str
+    time: str
+    range: str
+
+
+@dataclass(frozen=True)
 class OtherReferenceView(TrackingWarning):
     """The frame was compared with another reference view than the first.
 

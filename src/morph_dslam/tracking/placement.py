@@ -22,6 +22,7 @@ from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.hypothesis import Image
+from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.occlusion import drawn_depth
 from morph_dslam.tracking.options import TrackerOptions
@@ -138,7 +139,8 @@ class PlacedObject:
             seen=seen[0],
             keyframes=None if self.keyframes is None else self.keyframes[0],
         )
-        tracker.estimator.known.values = self.object.known
+        known, zero = tracker.estimator.known, self.object.time_zero
+        known.values, known.clock = self.object.known, None if zero is None else KnownTime.of(tracker.model, zero)
         return tracker
 
     def in_frames(self, registration: Registration, frames: Sequence[Frame]) -> PlacedObject:

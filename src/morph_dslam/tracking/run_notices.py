@@ -26,6 +26,7 @@ from morph_dslam.tracking.outcomes import (
     ReadoutNotUsed,
     SamePlace,
     Status,
+    TimeOutside,
     TrackingWarning,
 )
 from morph_dslam.tracking.run_results import RunResults
@@ -62,6 +63,11 @@ class RunWarning(StrEnum):
         "the images refute the known values of '{parameter}' in {count} of {n_frames} frames, first in frame {first}, "
         "by up to {largest:.0f} standard deviations: check the sensor's zero, its unit, its clock and its deviation, "
         "and the registration; estimates there hold to the sensor, and what it does not fit is left in the images"
+    )
+    TIME_OUTSIDE = (
+        "{count} of {n_frames} frames, first in frame {first}, are before the time at which the model's begins, or "
+        "after the end of its range: '{parameter}' counts as unknown there; check --time-zero, or build with a longer "
+        "range"
     )
     MODEL_FAILS = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
@@ -204,6 +210,8 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     same = _warned(run, SamePlace)
     for other in sorted({warning.other for _, warning in same}):
         tell([(frame, w) for frame, w in same if w.other == other], kind.SAME_PLACE, other=other)
+    outside = _warned(run, TimeOutside)
+    tell(outside, kind.TIME_OUTSIDE, parameter=outside[0][1].parameter if outside else "")
     refuted = _warned(run, KnownRefuted)
     for name in dict.fromkeys(warning.parameter for _, warning in refuted):
         of_one = [(frame, warning) for frame, warning in refuted if warning.parameter == name]

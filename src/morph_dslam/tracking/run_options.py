@@ -31,6 +31,7 @@ class ObjectOptions(FileOptions):
     points : names of places of it whose displacements are written and plotted, each with its coordinates in the
         undeformed object, metres.
     known : table of parameters that something else measures, by frame.
+    time_zero : time of the recording at which the model's time begins, seconds: its parameter of time is known then.
     tracker : what is measured, and what earlier frames add.
     """
 
@@ -44,6 +45,7 @@ class ObjectOptions(FileOptions):
     inner: tuple[Path, ...] = ()
     points: tuple[Place, ...] = ()
     known: Path | None = None
+    time_zero: float | None = None
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
 

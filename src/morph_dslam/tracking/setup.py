@@ -23,6 +23,7 @@ from morph_dslam.registration.registration import Registration, in_scene, load_r
 from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.known_values import KnownValues
 from morph_dslam.tracking.multi_camera import RigCamera
 from morph_dslam.tracking.named_points import NamedPoints
@@ -49,6 +50,7 @@ class TrackedObject:
     snap : whether its outline in the frame of landmarks corrects them.
     points : places of it that are followed by name; None where there are none.
     known : parameters that something else measures; None where there are none.
+    time_zero : time of the recording at which the model's time begins, seconds; None where it is not known.
     """
 
     name: str
@@ -63,6 +65,7 @@ class TrackedObject:
     snap: bool = False
     points: NamedPoints | None = None
     known: KnownValues | None = None
+    time_zero: float | None = None
 
     @property
     def scene(self) -> Scene | None:
@@ -139,12 +142,14 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     points = NamedPoints.of(model, part.points)
     known = None if part.known is None else KnownValues.read(part.known, model)
     again = {n: None if path is None else load_landmarks(path) for n, path in part.reregister_at}
-    options = part.tracker
+    if part.time_zero is not None:
+        _check_clock(KnownTime.of(model, part.time_zero), known)
+    options, zero = part.tracker, part.time_zero
     if part.registration is None:
         start = initializer if part.landmarks is None else load_landmarks(part.landmarks)
         assert start is not None
         said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap, "points": points, "known": known}
-        return TrackedObject(name, model, start, options, inner, reregister_at=again, **said)
+        return TrackedObject(name, model, start, options, inner, reregister_at=again, time_zero=zero, **said)
     registration, path = load_registration(part.registration, model), map_of(part.registration, run.map_path)
     if path is None and options.pose != "free":
         note = "no map was given or found beside the registration: the object is tracked as a free one"
@@ -165,7 +170,16 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
         run.click_px,
         points=points,
         known=known,
+        time_zero=zero,
     )
+
+
+def _check_clock(clock: KnownTime, known: KnownValues | None) -> None:
+    """Raise TrackingError if a table has the parameter of time as well."""
+    if known is not None and clock.index in known.indices:
+        raise TrackingError(
+            f"'{clock.parameter.name}' is in the table of known parameters, and --time-zero gives it too: leave out one"
+        )
 
 
 def map_of(registration: Path, given: Path | None) -> Path | None:

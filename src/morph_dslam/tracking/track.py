@@ -30,7 +30,7 @@ from morph_dslam.sources.live import LiveStream, PacedRecording
 from morph_dslam.sources.local_socket import SocketCamera
 from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.camera_check import CameraCheck
-from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options
+from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options, check_times
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
 from morph_dslam.tracking.frame_estimation import temporal_facts
@@ -140,6 +140,7 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
     run = _with_first_frame(run, objects)
     source, frames_at = _open_live(run, stack) if run.live else _open_recordings(run)
     check_depth(run, objects, source)
+    check_times(run, source)
     placed = [place(part, cameras, frames_at, run) for part in objects]
     return run, source, with_other_images(placed, run.other_cameras)
 

@@ -199,7 +199,8 @@ class Tracker:
             If image, depth or mask is not of the camera's size, or of another type.
         """
         camera = localization or self.locate(frame)
-        self.estimator.known.begin(frame.index if isinstance(frame, Frame) else None)
+        numbered = (frame.index, frame.timestamp) if isinstance(frame, Frame) else (None, None)
+        self.estimator.known.begin(*numbered)
         with frame_clock(STAGES) as clock:
             image = self._prepare(frame, occluder_depth, camera.image)
             prior = self._predict(camera)
@@ -407,7 +408,8 @@ class Tracker:
     ) -> FrameResult:
         """Status, estimate with all known errors in its covariance, and warnings."""
         number, has_moved = self._view.number, self._anchoring.has_moved
-        warnings = (*self._history.warnings, *warnings_of_place(has_moved, self.jumps, number, camera.why_lost))
+        told = (*self._history.warnings, *self.estimator.known.warnings)
+        warnings = (*told, *warnings_of_place(has_moved, self.jumps, number, camera.why_lost))
         if rejection is not None:
             placed = self._placed_by_map(camera)
             result = lost_result(self.model, hypothesis, rejection, placed, warnings)

@@ -1,0 +1,69 @@
+"""The model's time by the times of frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.errors import TrackingError
+from morph_dslam.model import Parameter
+from morph_dslam.tracking.combinations import check_options, check_times
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.known_time import KnownTime
+from morph_dslam.tracking.known_values import KnownValues
+from morph_dslam.tracking.outcomes import TimeOutside
+from morph_dslam.tracking.run_options import TrackOptions
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
+
+SHEET = bent_sheet_model(22, 16)
+TIME = Parameter("hold", "time", "s", 0.0, 20.0, 0.0)
+MODEL = replace(SHEET, parameters=(SHEET.parameters[0], TIME, SHEET.parameters[2]))
+
+
+def known_in(timestamp, known):
+    known.begin(7, timestamp)
+    return {MODEL.parameters[k].name: tuple(row) for k, row in zip(known.indices, known.now.tolist(), strict=True)}
+
+
+def test_time_is_that_of_the_frame_after_the_zero_as_exact_as_half_an_interval_at_most():
+    known = Estimator(MODEL, CAMERA).known
+    known.clock = KnownTime.of(MODEL, 99.7)
+    assert known_in(100.0, known) == {"hold": pytest.approx((0.3, 0.02))}
+    assert known_in(100.03, known) == {"hold": pytest.approx((0.33, 0.015))}
+    assert known_in(104.0, known) == {"hold": pytest.approx((4.3, 0.02))}
+    assert known.warnings == ()
+    # Before the zero, and beyond the range, it is not known, and that is said.
+    assert known_in(119.8, known) == {}
+    assert known.warnings == (TimeOutside("hold", "20.1 s", "0 to 20 s"),)
+    assert known_in(99.0, known) == {}
+    assert [warning.time for warning in known.warnings] == ["-0.7 s"]
+
+
+def test_time_is_known_beside_a_sensor():
+    known = Estimator(MODEL, CAMERA).known
+    known.clock = KnownTime.of(MODEL, 1.0)
+    known.values = KnownValues(np.array([0]), {7: np.array([[0.03, 1e-3]])})
+    assert known_in(3.0, known) == {"arch": (0.03, 1e-3), "hold": pytest.approx((2.0, 0.02))}
+
+
+def test_models_without_one_time_are_refused():
+    with pytest.raises(TrackingError, match="has no parameter that measures time: leave it out"):
+        KnownTime.of(SHEET, 0.0)
+    twice = replace(MODEL, parameters=(replace(TIME, name="delay"), *MODEL.parameters[1:]))
+    with pytest.raises(TrackingError, match=r"several parameters that measure time \(delay, hold\)"):
+        KnownTime.of(twice, 0.0)
+
+
+def test_frames_without_times_and_rigs_are_refused():
+    class Numbered:
+        has_assumed_times = True
+
+    asked = {"model": "m.morph", "landmarks": "l.csv", "camera": "c.yaml", "frames": "f", "output": "o"}
+    run = TrackOptions(**asked, time_zero=1.0)
+    with pytest.raises(TrackingError, match=r"nothing tells the times of the frames of f: .* give --fps"):
+        check_times(run, Numbered())
+    check_times(replace(run, fps=30.0), Numbered())
+    check_times(TrackOptions(**asked), Numbered())
+    with pytest.raises(TrackingError, match="leave out --time-zero or --with"):
+        check_options(replace(run, other_cameras=("g",)))
