@@ -279,7 +279,7 @@ def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recordi
     assert (apart < 3.0 * column(tmp_path / "run", "pose_std")[:, 3:]).all()
 
 
-def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, capsys, refused):
+def test_after_a_shorter_recording_the_run_goes_on_and_it_is_named(recording, tmp_path, capsys, refused):
     folder, _ = recording
     front = renumbered(folder / "front", tmp_path / "front", 0, last=SCAN + 5)
     short = renumbered(folder / "aside", tmp_path / "short", 0, last=SCAN + 2)
@@ -287,10 +287,9 @@ def test_a_shorter_recording_ends_the_run_and_is_named(recording, tmp_path, caps
     assert f"frame {FRAMES - 1} is not in" in refused(*arguments)
     arguments[arguments.index("--range") + 1] = f"{SCAN - 1}-"
     assert main(arguments) == 0
-    frames = load_run(tmp_path / "run").frames
-    assert frames[-1] == SCAN + 1
-    said = capsys.readouterr().out
-    assert f"{len(frames)} were tracked, to the end of the shortest recording" in said
+    run = load_run(tmp_path / "run")
+    assert (run.frames[-1], set(run.status)) == (SCAN + 4, {"tracked"})
+    assert "camera 1 lacks 3" in capsys.readouterr().out
 
 
 def live_command(folder, output, *more):
