@@ -160,6 +160,13 @@ def test_terms_are_multiplied_by_amplitudes(text, quantity, value, used):
     assert found.expression(MU, {"ramp": 1.5}) == pytest.approx(value, rel=1e-14)
 
 
+def test_extremes_are_those_of_all_corners_and_values():
+    ends = np.array([[p.lower, p.upper] for p in PARAMETERS])
+    falling = Amplitudes(2, {"ramp": Amplitude((0.0, 1.0, 2.0), (0.0, 3.0, -2.0))})
+    assert read_affine("1 kPa - load * ramp", "pressure", PARAMETERS, falling).extremes(ends) == (-14e3, 11e3)
+    assert read_affine("10 N - 2 N * share", "force", PARAMETERS, falling).extremes(ends) == (8.0, 10.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

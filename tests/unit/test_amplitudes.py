@@ -129,6 +129,14 @@ def test_amplitudes_that_cannot_be_are_refused(change: dict[str, Any], message: 
         bar(time=BAR["time"] | {"amplitudes": change})
 
 
+def test_a_traction_with_an_amplitude_that_is_far_too_large_is_asked_about() -> None:
+    loads = [{"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "press * ramp"]}]
+    parameters = BAR["parameters"] | {"press": {"range": ["0 kPa", "10 MPa"]}}
+    ramp = {"ramp": {"times": ["1 s", "3 s"], "values": [0.0, 2.0]}}
+    study = bar(loads=loads, parameters=parameters, time=BAR["time"] | {"amplitudes": ramp})
+    assert "reaches 20 MPa, 52 times the shear modulus" in study.load_doubt()
+
+
 def test_paths_need_a_time() -> None:
     content = copy.deepcopy(BAR) | {"sampling": {"scheme": "paths"}, "time": None}
     del content["materials"]["gel"]["prony"]

@@ -98,6 +98,17 @@ class Affine:
         in_products = {k for product in self.products for k in (product.index, product.clock) if k is not None}
         return {int(k) for k in np.flatnonzero(self.slopes)} | in_products
 
+    def extremes(self, ends: Array) -> tuple[float, float]:
+        """The least and the largest value where each term has its own, with parameters between ``ends`` (d, 2)."""
+        terms = [slope * end for slope, end in zip(self.slopes, ends, strict=True)]
+        for product in self.products:
+            parameter = np.ones(1) if product.index is None else ends[product.index]
+            terms.append(product.factor * np.outer(parameter, product.amplitude.values).ravel())
+        return (
+            self.constant + sum(float(term.min()) for term in terms),
+            self.constant + sum(float(term.max()) for term in terms),
+        )
+
     @property
     def fixed(self) -> bool:
         """Whether no parameter changes it."""

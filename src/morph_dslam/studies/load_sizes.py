@@ -15,7 +15,7 @@ from morph_dslam.meshing.mesh_summary import faces_figures
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
-from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
 from morph_dslam.studies.body_study import numbered, range_ends
 from morph_dslam.studies.solid_sections import CouplingSection, ForceLoad, MovingLineLoad, MovingPatchLoad, Value
 
@@ -34,6 +34,7 @@ def load_doubt(
     materials: Iterable[Any],
     mesh: Mesh,
     parameters: Sequence[Parameter],
+    amplitudes: Amplitudes = NO_AMPLITUDES,
 ) -> str:
     """A sentence on the first load that is far too large for the stiffest material, or acts far away; else "".
 
@@ -42,25 +43,28 @@ def load_doubt(
     loads, couplings, materials : sections of a study.
     mesh : with the sets that loads and couplings name.
     parameters : that they may name; materials count at the defaults, loads where the ranges make them largest.
+    amplitudes : that they may name.
     """
-    shear = max(_shear_modulus(section, parameters) for section in materials)
+    shear = max(_shear_modulus(section, parameters, amplitudes) for section in materials)
     coupled = numbered("coupling", couplings)
     for where, section in (*numbered("load", loads), *coupled):
-        largest = _largest_stress(section, mesh, parameters)
+        largest = _largest_stress(section, mesh, parameters, amplitudes)
         if largest > MOST_MODULI * shear:
             return (
                 f"{where.capitalize()} reaches {_shown(largest)}, {largest / shear:.0f} times the shear modulus of the "
                 f"stiffest material ({_shown(shear)}): are its unit and that of the modulus right? "
             )
-    return "".join(_point_doubt(where, section, mesh, parameters) for where, section in coupled)
+    return "".join(_point_doubt(where, section, mesh, parameters, amplitudes) for where, section in coupled)
 
 
-def _point_doubt(where: str, section: CouplingSection, mesh: Mesh, parameters: Sequence[Parameter]) -> str:
+def _point_doubt(
+    where: str, section: CouplingSection, mesh: Mesh, parameters: Sequence[Parameter], amplitudes: Amplitudes
+) -> str:
     """A sentence if a coupling's point is, at the defaults, many lengths of the mesh away from its set; else ""."""
     if section.point is None:
         return ""
     defaults = np.array([parameter.default for parameter in parameters])
-    point = np.array([read_affine(value, "length", parameters)(defaults) for value in section.point])
+    point = np.array([read_affine(value, "length", parameters, amplitudes)(defaults) for value in section.point])
     distance = float(np.linalg.norm(mesh.nodes[mesh.set_nodes(section.on)] - point, axis=1).min())
     length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
     if distance <= MOST_LENGTHS * length:
@@ -95,19 +99,19 @@ def shell_load_doubt(problem: ShellProblem) -> str:
     return ""
 
 
-def _shear_modulus(section: Any, parameters: Sequence[Parameter]) -> float:
+def _shear_modulus(section: Any, parameters: Sequence[Parameter], amplitudes: Amplitudes) -> float:
     """Of a material at small strain, Pa."""
     defaults = np.array([parameter.default for parameter in parameters])
 
     def read(value: Value, quantity: str | None) -> float:
-        return read_affine(value, quantity, parameters)(defaults)
+        return read_affine(value, quantity, parameters, amplitudes)(defaults)
 
     made = section.make(read)
     assert isinstance(made, Material)
     return isotropic_average(made.small_strain_stiffness())[1]
 
 
-def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter]) -> float:
+def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter], amplitudes: Amplitudes) -> float:
     """The largest pressure, or component of a traction, anywhere in the ranges of the parameters, Pa.
 
     Forces over a surface count with their mean, those of moving loads with that at their centre on a plane, moments
@@ -118,11 +122,9 @@ def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter]) -
     largest = [0.0]
 
     def read(value: Value, quantity: str | None) -> float:
-        found = read_affine(value, quantity, parameters)
+        found = read_affine(value, quantity, parameters, amplitudes)
         if quantity in over:
-            terms = np.array(found.slopes)[:, None] * ends
-            sums = found.constant + np.array([terms.min(axis=1).sum(), terms.max(axis=1).sum()])
-            largest.append(float(np.abs(sums).max()) / over[quantity])
+            largest.append(float(np.abs(found.extremes(ends)).max()) / over[quantity])
         return found.constant
 
     section.make(read)

@@ -19,7 +19,7 @@ from morph_dslam.mechanics.landed_force import (
 from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
-from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
 from morph_dslam.studies.body_study import numbered, range_ends
 from morph_dslam.studies.shape_sections import Shape, moved_nodes
 from morph_dslam.studies.solid_sections import MovingLineLoad, MovingPatchLoad
@@ -50,7 +50,9 @@ def check_widths(loads: Sequence[Any], mesh: Mesh) -> None:
             )
 
 
-def check_reach(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter]) -> None:
+def check_reach(
+    loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter], amplitudes: Amplitudes = NO_AMPLITUDES
+) -> None:
     """Refuse moving loads that stay farther from their surface than the mesh is long (StudyError): a wrong unit.
 
     Looked at are the defaults, the ends of the parameters' ranges and states spread within.
@@ -60,7 +62,7 @@ def check_reach(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter
     states += [mu for _, mu in range_ends(parameters, list(range(len(parameters))), True)]
     for where, load in _moving(loads):
         nodes = mesh.nodes[np.unique(mesh.face_triangles(_faces(mesh, load.on)))]
-        centre = [read_affine(value, "length", parameters) for value in load.centre]
+        centre = [read_affine(value, "length", parameters, amplitudes) for value in load.centre]
         places = np.unique([[c(mu) for c in centre] for mu in states], axis=0)
         distance = min(float(_distances(load, nodes, place).min()) for place in places)
         if distance > length:
@@ -86,7 +88,13 @@ def _distances(load: Moving, nodes: Array, centre: Array) -> Array:
     return np.linalg.norm(arms, axis=1)
 
 
-def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter], shape: Shape = ()) -> list[str]:
+def landing_warnings(
+    loads: Sequence[Any],
+    mesh: Mesh,
+    parameters: Sequence[Parameter],
+    shape: Shape = (),
+    amplitudes: Amplitudes = NO_AMPLITUDES,
+) -> list[str]:
     """A sentence for each moving load a part of whose force falls beside its surface.
 
     Looked at are the defaults of the parameters, and the ends of the ranges of those that move the load or the shape.
@@ -94,9 +102,8 @@ def landing_warnings(loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Para
     """
     found = []
     for where, load in _moving(loads):
-        centre = [read_affine(value, "length", parameters) for value in load.centre]
-        slopes = [value.slopes for value in (*centre, *(amplitude for amplitude, _ in shape))]
-        used = np.flatnonzero(np.any(slopes, axis=0)).tolist()
+        centre = [read_affine(value, "length", parameters, amplitudes) for value in load.centre]
+        used = sorted(set[int]().union(*(value.used for value in (*centre, *(moved for moved, _ in shape)))))
         states = [np.array([p.default for p in parameters]), *(mu for _, mu in range_ends(parameters, used, True))]
         faces = mesh.face_triangles(_faces(mesh, load.on))
 

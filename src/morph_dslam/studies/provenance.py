@@ -78,7 +78,7 @@ def _locking(study: BodyStudy) -> list[str]:
     defaults = np.array([parameter.default for parameter in parameters])
 
     def read(value: Any, quantity: str | None) -> float:
-        return read_affine(value, quantity, parameters)(defaults)
+        return read_affine(value, quantity, parameters, study.amplitudes())(defaults)
 
     materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
     mesh, solver = study.solid_mesh(), study.solver

@@ -235,7 +235,12 @@ class SolidStudy(BodyStudy, Section):
     def load_doubt(self) -> str:
         """A sentence, and a space, on a load that is too large for the materials by far; else ""."""
         return load_doubt(
-            self.loads, self.couplings, self.materials.values(), self.solid_mesh(), self.model_parameters()
+            self.loads,
+            self.couplings,
+            self.materials.values(),
+            self.solid_mesh(),
+            self.model_parameters(),
+            self.amplitudes(),
         )
 
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
@@ -320,7 +325,7 @@ class SolidStudy(BodyStudy, Section):
         """The discretised solid, with the study's own elements if ``options`` name no others."""
         parameters, mesh = self.model_parameters(), self.solid_mesh()
         check_widths(self.loads, mesh)
-        check_reach(self.loads, mesh, parameters)
+        check_reach(self.loads, mesh, parameters, self.amplitudes())
         symbols = self._symbols()
         reader = reader_of(symbols)
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
@@ -381,7 +386,7 @@ class SolidStudy(BodyStudy, Section):
         coarse = coarse_set_warnings(mesh, {name: part for name, part in self.sets.items() if name in named})
         moves = any(load.kind in ("moving_patch", "moving_line") for load in self.loads)
         shape = read_shape(self.shape, mesh, parameters) if moves else ()
-        return coarse + landing_warnings(self.loads, mesh, parameters, shape)
+        return coarse + landing_warnings(self.loads, mesh, parameters, shape, self.amplitudes())
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""

@@ -106,7 +106,7 @@ def _relaxation_times(study: SolidStudy) -> list[float]:
     for mu in (defaults, *(mu for _, mu in range_ends(parameters, list(range(len(parameters))), combined=False))):
 
         def read(value: Value, quantity: str | None, mu: Array = mu) -> float:
-            return read_affine(value, quantity, parameters)(mu)
+            return read_affine(value, quantity, parameters, study.amplitudes())(mu)
 
         for section in study.materials.values():
             made = section.make(read)
