@@ -47,7 +47,9 @@ class TimePaths:
 
         Where several parameters measure time, as relaxation times do, the clock is the one that paths run along.
         """
-        clocks = [k for k, parameter in enumerate(parameters) if parameter.quantity == "time"] * (len(parameters) > 1)
+        if len(parameters) < 2:
+            return None
+        clocks = [k for k, parameter in enumerate(parameters) if parameter.quantity == "time"]
         found = (TimePaths._along(clock, samples, parameters[clock]) for clock in clocks)
         return next((paths for paths in found if paths is not None), None)
 

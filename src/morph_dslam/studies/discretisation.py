@@ -157,13 +157,29 @@ def _estimate(
     solving = SWEEP_TANGENTS * _tangent_seconds(sweep.problem, kept[chosen[0]]) * solves / (study.work.workers or 1)
     end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * max(seconds, solving), FLOOR)
     announce(f"solving {len(chosen)} held-out states again with finer elements")
-    solved, left_out = {}, ""
-    for index in chosen:
+
+    def solve_again(index: int) -> Snapshot:
         state, pivots = kept[index], int(kept[index]["pivots"])
+        found = finer.solve(state["dofs"], state["mu"], lambda: time.monotonic() < end)
+        _check_same_branch(finer.problem, found, pivots)
+        return _snapshot(finer.problem, found)
+
+    solved, left_out = _solved_again(chosen, solve_again)
+    figures = _figures(model, snapshots, sweep.problem, finer.problem, solved)
+    return figures | left_out
+
+
+def _solved_again(
+    chosen: Sequence[int], solve_again: Callable[[int], Snapshot]
+) -> tuple[dict[int, Snapshot], dict[str, str]]:
+    """Finer solutions of the ``chosen`` held-out states, by index, and as "left_out" why some are missing, if any.
+
+    Raises _NotEstimated where all are.
+    """
+    solved, left_out = dict[int, Snapshot](), ""
+    for index in chosen:
         try:
-            found = finer.solve(state["dofs"], state["mu"], lambda: time.monotonic() < end)
-            _check_same_branch(finer.problem, found, pivots)
-            solved[index] = _snapshot(finer.problem, found)
+            solved[index] = solve_again(index)
         except OutOfTime:
             left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
             break
@@ -171,8 +187,7 @@ def _estimate(
             left_out = f"one was left out: {error}"
     if not solved:
         raise _NotEstimated(left_out)
-    figures = _figures(model, snapshots, sweep.problem, finer.problem, solved)
-    return figures | ({"left_out": left_out} if left_out else {})
+    return solved, {"left_out": left_out} if left_out else {}
 
 
 def _estimate_in_time(
@@ -184,20 +199,15 @@ def _estimate_in_time(
     chosen = chosen_states(snapshots.held_out, study.sampling.refined)[: _affordable_paths(study, snapshots, unknowns)]
     end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * seconds, FLOOR)
     announce(f"following {len(chosen)} held-out states again with finer elements and half the increments of time")
-    halved, solved, left_out = sweep.finer_in_time(finer), {}, ""
-    for index in chosen:
-        try:
-            solved[index] = _followed(halved, snapshots.held_out[index].coordinates, lambda: time.monotonic() < end)
-        except OutOfTime:
-            left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
-            break
-        except SolverError as error:
-            left_out = f"one was left out: {error}"
-    if not solved:
-        raise _NotEstimated(left_out)
+    halved = sweep.finer_in_time(finer)
+
+    def follow_again(index: int) -> Snapshot:
+        return _followed(halved, snapshots.held_out[index].coordinates, lambda: time.monotonic() < end)
+
+    solved, left_out = _solved_again(chosen, follow_again)
     figures = _figures(model, snapshots, sweep.problem, finer, solved)
     figures["method"] += ", half the increments of time"
-    return figures | ({"left_out": left_out} if left_out else {})
+    return figures | left_out
 
 
 def _followed(sweep: ViscousSweep, mu: Array, in_time: Callable[[], bool]) -> Snapshot:
