@@ -37,6 +37,7 @@ from scipy.optimize import least_squares
 from track import BEGUN, TrackedSeal
 
 import morph_dslam as md
+from morph_dslam.extend import run_and_report_errors
 from morph_dslam.extend.geometry import fit_similarity
 from morph_dslam.extend.models import MaterialPoints, SeparatedField, von_mises
 from morph_dslam.extend.registration import run_registration
@@ -250,8 +251,13 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=61, help="the first of them (%(default)s)")
     parser.add_argument("--video", action="store_true", help="draw the tracked videos")
     parser.add_argument("--kept", action="store_true", help="take the figures of runs that are complete from disk")
-    arguments = parser.parse_args()
+    return run_and_report_errors(run, parser.parse_args(), "what has been filmed is kept")
+
+
+def run(arguments: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
+    if not MODEL.is_file():
+        raise md.MorphError(f"there is no model {MODEL}: build it with `python examples/boot_seal/run.py` first")
     keep_model(STUDY, FOREIGN)
     last = list[dict[str, dict[str, float]]]()
     for seed in range(arguments.first, arguments.first + arguments.seeds):
@@ -267,7 +273,6 @@ def main() -> int:
         for name, values in found.items():
             print(f"seed {seed} {name}: {shown(values)}")
     print(last_line(last))
-    return 0
 
 
 def last_line(found: list[dict[str, dict[str, float]]]) -> str:

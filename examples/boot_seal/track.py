@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> None:
     output = arguments.output if scene.stem == "scene" else arguments.output / scene.stem
     sequence = output / "recording"
     if not model.is_file():
-        raise md.MorphError(f"there is no model {model}: build it with `python {HERE.name}/run.py` first")
+        raise md.MorphError(f"there is no model {model}: build it with `python examples/{HERE.name}/run.py` first")
     keep_sequence(scene, model, sequence)
     camera, frames = sequence / "camera.yaml", sequence / "frames"
     run_slam(source=frames, camera=camera, output=output / "scan", first=0, last=arguments.frozen_at, overwrite=True)
