@@ -352,8 +352,8 @@ BENCHMARKS = {
         "python benchmarks/elements.py",
         "hex27 cells twice as fine along the folds of the seal",
         lines=5,
-        about="Half of the boot seal, the lever at 52 degrees. The first two lines compare with `hex27` on the same nodes, "
-        "which itself is less exact than `hex8` with enhanced strains.",
+        about="Half of the boot seal, the lever at 52 degrees. The first two lines compare with `hex27` on the same "
+        "nodes, which itself is less exact than `hex8` with enhanced strains.",
     ),
     "contact": Benchmark(
         "Mechanics",
