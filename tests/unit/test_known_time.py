@@ -54,6 +54,9 @@ def test_models_without_one_time_are_refused():
     twice = replace(MODEL, parameters=(replace(TIME, name="delay"), *MODEL.parameters[1:]))
     with pytest.raises(TrackingError, match=r"several parameters that measure time \(delay, hold\)"):
         KnownTime.of(twice, 0.0)
+    # A relaxation time is not the clock that the study names.
+    named = replace(twice, provenance={"time_parameter": "hold"})
+    assert KnownTime.of(named, 0.0).index == 1
 
 
 def test_frames_without_times_and_rigs_are_refused():

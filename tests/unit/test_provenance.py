@@ -41,6 +41,20 @@ def test_versions_and_linear_solver(monkeypatch):
     assert facts["versions"]["numpy"] == version("numpy")
     assert facts["versions"]["python"] == platform.python_version()
     json.dumps(facts)
+    assert "time_parameter" not in facts
+
+
+def test_the_parameter_of_time_is_known_among_others_that_measure_time():
+    content = tomllib.loads(STUDY)
+    material = next(iter(content["materials"].values()))
+    material["prony"] = {"relative_moduli": [0.3], "times": ["tau"]}
+    content["parameters"] |= {"tau": {"range": ["1 s", "8 s"]}, "held": {"range": ["0 s", "20 s"]}}
+    content["time"] = {"parameter": "held", "step": "1 s"}
+    study = make_study(content)
+    model = replace(bent_sheet_model(3, 3), parameters=tuple(study.model_parameters()))
+    assert [model.parameters[k].name for k in model.clocks] == ["tau", "held"]
+    known = replace(model, provenance=provenance("", study, model))
+    assert [known.parameters[k].name for k in known.clocks] == ["held"]
 
 
 def test_every_key_stands_in_the_reference():

@@ -160,7 +160,7 @@ class ReducedModel:
     energy : of the unknown loads, whose coefficients are then the last parameters (`with_unknown_loads`); None
         without.
     certificate : held-out errors and how they were measured, plain JSON.
-    provenance : versions, study text, mesh hash, plain JSON.
+    provenance : versions, study text, mesh hash, the study's parameter of time, plain JSON.
     """
 
     name: str
@@ -192,6 +192,13 @@ class ReducedModel:
     def study_parameters(self) -> tuple[Parameter, ...]:
         """The parameters that the study names: all but the coefficients of unknown loads."""
         return self.parameters[: len(self.parameters) - self.n_loads]
+
+    @property
+    def clocks(self) -> tuple[int, ...]:
+        """Numbers of the parameters that may be the time of the material: the study's ``[time]``, or all of seconds."""
+        named = self.provenance.get("time_parameter")
+        measured = [(k, p) for k, p in enumerate(self.study_parameters) if p.quantity == "time"]
+        return tuple(k for k, p in measured if named in (None, p.name))
 
     @property
     def without_loads(self) -> ReducedModel:

@@ -42,10 +42,12 @@ def linear_solver(study: Study) -> str | None:
 
 def provenance(study_text: str, study: Study, model: ReducedModel) -> dict[str, Any]:
     """What a model file says of its origin, in plain JSON types; ``study_text`` is the file's."""
+    clock = study.time.parameter if isinstance(study, SolidStudy) and study.time else None
     return {
         "study": study_text,
         "mesh_sha256": mesh_hash(model),
         "linear_solver": linear_solver(study),
+        **({"time_parameter": clock} if clock else {}),
         "versions": versions(),
     }
 

@@ -36,9 +36,9 @@ class KnownTime:
         Raises
         ------
         TrackingError
-            If not exactly one of its parameters measures time.
+            If none of its parameters measures time, or several and its study does not say which one is the time.
         """
-        clocks = [(k, p) for k, p in enumerate(model.study_parameters) if p.quantity == "time"]
+        clocks = [(k, model.parameters[k]) for k in model.clocks]
         if len(clocks) != 1:
             named = ", ".join(p.name for _, p in clocks)
             raise TrackingError(
