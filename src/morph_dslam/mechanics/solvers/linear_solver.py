@@ -12,12 +12,14 @@ Symmetric matrices come to the libraries as their upper triangle in CSR form wit
 from __future__ import annotations
 
 import os
+import sys
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Protocol
 
 import ngsolve as ngs
@@ -55,11 +57,14 @@ class Pardiso:
     """Intel MKL's PARDISO through pypardiso; the analysis is kept while the pattern stays."""
 
     def __init__(self, symmetric: bool, threads: int | None) -> None:
+        # pypardiso would search the whole environment's folder, when imported and for every solver: half a second.
+        usual = sorted(Path(sys.prefix, "lib").glob("libmkl_rt.so*"))
+        if usual:
+            os.environ.setdefault(LIBRARY_VARIABLE, str(usual[0]))
         from pypardiso import PyPardisoSolver
 
         self._symmetric = symmetric
         self._handle: Any = PyPardisoSolver(REAL_SYMMETRIC_INDEFINITE if symmetric else REAL_UNSYMMETRIC)
-        # pypardiso would search the whole environment's folder again for every solver: half a second and more.
         os.environ.setdefault(LIBRARY_VARIABLE, self._handle.libmkl._name)
         for number, value in PARDISO_SETTINGS.items():
             self._handle.set_iparm(number, value)
