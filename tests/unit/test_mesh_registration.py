@@ -11,10 +11,10 @@ from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.meshing.generators import tube
 from morph_dslam.registration.icp import Surface, fit_surface
-from morph_dslam.registration.mesh import register_in_unit, register_mesh
+from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, register_mesh
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, OtherSize, OutlineElsewhere, TooLittleTexture
 from morph_dslam.registration.register import register
-from morph_dslam.registration.registration import Axis
+from morph_dslam.registration.registration import Axis, Rival
 from morph_dslam.registration.scene import MapPoints, View
 from morph_dslam.registration.search_space import TURNS, attitudes, find_planes
 from morph_dslam.registration.texture import TextureComparison
@@ -154,6 +154,16 @@ def test_two_of_a_kind_are_ambiguous():
     off = np.array([[apart(place, true, nodes) for true in both] for place in there])
     assert sorted(off.argmin(axis=1)) == [0, 1]
     assert off.min(axis=1).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("score", "rivals", "share"), [(50.0, (41.0,), 0.82), (50.0, (39.0,), None), (-0.2, (), None), (-0.2, (30.0,), 1.0)]
+)
+def test_a_place_is_ambiguous_by_another_one_alone(score, rivals, share):
+    found = MeshRegistration(
+        WORLD, None, score, tuple(Rival(METRIC, each) for each in rivals), n_explained=0, rms_px=0.1, axis=None
+    )
+    assert found.warnings == (() if share is None else (Ambiguous(Ambiguity.SECOND_PLACE, share),))
 
 
 def test_an_absent_object_is_not_found():

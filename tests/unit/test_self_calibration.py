@@ -14,7 +14,7 @@ from morph_dslam.slam.camera_notes import camera_notes
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.rolling_shutter import MiddleRowPoses, correct_path
 from morph_dslam.slam.scene import refine_camera
-from morph_dslam.slam.self_calibration import TERMS, estimate_camera, with_terms_of
+from morph_dslam.slam.self_calibration import TERMS, CameraEstimate, TermEstimate, estimate_camera, with_terms_of
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 LENS = (-0.28, 0.07, 0.0, 0.0)
@@ -91,6 +91,15 @@ def test_a_wrong_camera_is_named_and_a_right_one_is_not(true, given, wrong):
     assert [estimate.camera.cx, estimate.camera.cy] == pytest.approx([319.5, 239.5], abs=6.0)
     assert (estimate.camera.distortion or (0.0, 0.0))[:2] == pytest.approx((true.distortion or LENS[2:])[:2], abs=0.02)
     assert bool(list(camera_notes(estimate))) == bool(wrong)
+
+
+@pytest.mark.parametrize(("estimated", "is_unlikely"), [(678.7, True), (740.0, False)])
+def test_a_given_value_outside_of_a_wide_interval_is_unlikely(estimated, is_unlikely):
+    std, given = 51.85, 840.0
+    focal = TermEstimate((given,), (estimated,), (std,), abs(estimated / given - 1.0), std / given, 0.03)
+    assert not focal.is_observable
+    (note,) = camera_notes(CameraEstimate(CAMERA, {"focal": focal}))
+    assert ("the given focal length is unlikely" in note) == is_unlikely
 
 
 def test_a_lens_whose_elements_are_not_centred_spoils_no_focal_length():

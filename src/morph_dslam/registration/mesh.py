@@ -149,8 +149,10 @@ class MeshRegistration:
             warnings.append(Ambiguous(Ambiguity.UNCONFIRMED))
         elif self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX:
             warnings.append(Ambiguous(Ambiguity.IMAGES_DIFFER, self.rms_px))
-        elif self.runner_up > AMBIGUOUS * self.score:
-            warnings.append(Ambiguous(Ambiguity.SECOND_PLACE, self.runner_up / self.score))
+        elif self.runner_up > max(AMBIGUOUS * self.score, 0.0):
+            # A place that landmarks give may have no score of its own, as map points are few or seem occluded.
+            share = self.runner_up / self.score if self.score > 0.0 else 1.0
+            warnings.append(Ambiguous(Ambiguity.SECOND_PLACE, share))
         return tuple(warnings) if self.unrefined is None else (*warnings, self.unrefined)
 
     @property

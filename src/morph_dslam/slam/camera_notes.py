@@ -34,7 +34,11 @@ def camera_notes(estimate: CameraEstimate, deforms: bool = False) -> Iterator[st
         yield "this recording cannot check the camera file: too few of its frames share enough points"
     elif hidden:
         named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in hidden]
-        yield f"this recording cannot check the camera file: unobservable here: {'; '.join(named)}"
+        unlikely = " and ".join(_NAMES[term] for term in hidden if estimate.terms[term].is_wrong)
+        yield (
+            f"this recording cannot check the camera file: unobservable here: {'; '.join(named)}"
+            + f". Check it all the same: the given {unlikely} is unlikely" * bool(unlikely)
+        )
 
 
 _NAMES: dict[CameraTerm, str] = {
