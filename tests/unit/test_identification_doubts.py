@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morph_dslam.camera import Camera
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import reaction_in_direction
 from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
-from morph_dslam.identification.doubts import likeness
+from morph_dslam.evaluation.likeness import likeness
+from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import FACTOR, Identification, identify
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
 from morph_dslam.identification.report import identification_lines, summarise
@@ -42,6 +44,7 @@ def stretched_plate() -> ReducedModel:
 
 
 STRETCHES = np.linspace(0.05, 0.95, 19)
+RANDOM = np.random.default_rng(7)
 NOISE = 0.3 * np.random.default_rng(3).normal(size=19)
 
 
@@ -80,6 +83,87 @@ def test_another_law_is_seen_from_neighbouring_residuals() -> None:
     table = forces(of_law(1.0) + NOISE)
     found = identify(table.model, [table], moduli=True)
     assert "neighbouring residuals of force are alike" in lines(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "unit"),
+    [("force_g", 0.8 * 9.80665e-3, "N"), ("force", 1.25 / 9.80665e-3, "g"), ("force", 30, "")],
+)
+def test_a_factor_of_all_moduli_that_a_unit_explains_is_doubted(name: str, factor: float, unit: str) -> None:
+    """One of 127 is beyond the range that is searched, but its size is found from the forces."""
+    right = forces(factor * of_law(0.0) + 3.0)
+    table = replace(right, curve=replace(right.curve, name=name))
+    figures = summarise(identify(table.model, [table], moduli=True))
+    (notice,) = figures["measurements"][0]["notices"]
+    assert (notice["kind"], notice["unit"]) == ("other_size", unit)
+    assert notice["factor"] == pytest.approx(factor, rel=1e-4)
+    at_end = "note: moduli_factor is at the end of its range, 0.01 to 100 for every model: check units"
+    text = "\n".join(identification_lines(figures))
+    is_beyond = not 0.01 < factor < 100.0
+    assert (at_end in text) == is_beyond
+    assert ("without an interval" in text) == is_beyond
+
+
+def test_forces_in_other_units_are_refused_with_the_unit_that_is_meant() -> None:
+    """Beyond ten times the largest factor that is searched."""
+    right = forces(1250.0 * of_law(0.0))
+    table = replace(right, curve=replace(right.curve, name="force_kN"))
+    with pytest.raises(IdentificationError, match=r"1250 times .* with values in N it would be 1\.25 times"):
+        identify(table.model, [table], moduli=True)
+
+
+@pytest.mark.parametrize("shift", [-1, 0, 1])
+def test_forces_of_other_frames_are_named(shift: int) -> None:
+    model, frames = stretched_plate(), np.arange(40)
+    stretches = 0.5 + 0.4 * np.sin(2.0 * np.pi * frames / 20.0)
+    words, poses = ("tracked",) * 40, np.tile(np.eye(4), (40, 1, 1))
+    states = np.column_stack([stretches, np.zeros(40)])
+    run = Run(model, Camera(640, 480, 500.0, 500.0, 320.0, 240.0), frames, words, words, poses, states, {})
+    curve = ForceCurve("frame", frames + float(shift), 130.0 * stretches + 0.2 * RANDOM.normal(size=40))
+    table = MeasuredForces(model, curve, reaction_in_direction(model, "edge:x"), run)
+    notices = summarise(identify(model, [table], moduli=True))["measurements"][0]["notices"]
+    assert [(notice["kind"], notice["shift"]) for notice in notices] == [("other_frame_numbers", -shift)] * abs(shift)
+
+
+def stiff_plate(share: float) -> ReducedModel:
+    """The plate, stretched by a; a modulus between 0 and 1 MPa stretches it by that share more."""
+    plate = stretched_plate()
+    modulus = Parameter("b", "stress", "MPa", 0.0, 1e6, 0.0)
+    functions = ParameterFunctions(np.zeros(2), np.array([1.0, 1e6]), np.array([[0, 0], [1, 0], [0, 1]]), np.eye(3))
+    shape = np.zeros((3, 4, 3))
+    shape[:, :, 0] = np.outer([0.5 + share / 2.0, 0.5, share / 2.0], CORNERS[:, 0])
+    return replace(plate, parameters=(plate.parameters[0], modulus), displacement=SeparatedField(shape, functions))
+
+
+def test_a_modulus_on_which_shapes_hardly_depend_is_said_not_to_be_determined_by_them() -> None:
+    """Over the range two of twelve coordinates change by 0.1 mm; they are off by 1 mm, up or down by turns."""
+    model, share = stiff_plate(1e-4), 1e-4
+    states, known = ("s0",) * 4 + ("s1",) * 4, {"a": np.repeat([0.2, 0.4], 4)}
+    measured = np.tile(CORNERS, (2, 1)) + np.outer(known["a"], [1, 0, 0]) * np.tile(CORNERS, (2, 1))
+    measured[:, 0] += np.tile([1e-3, -1e-3, 2e-3, -1e-3], 2)
+    table = MeasuredPoints(model, states, known, np.tile(CORNERS, (2, 1)), measured)
+    found = identify(model, [table], ["b"])
+    figures = summarise(found)
+    assert figures["measurements"][0]["change_over_range_rms"]["b"] == pytest.approx(1e3 * share * np.sqrt(2.0 / 12.0))
+    assert not found["b"].identified
+    text = lines(found)
+    assert "over its whole range b changes points by 0.041 mm rms, less than" in text
+    assert "measure forces (--force)" in text
+    assert "the model may need a wider one" not in text
+    low, high = found["b"].interval
+    assert 0.0 <= low <= high <= 1e6
+
+
+def test_intervals_end_with_the_range_and_say_so() -> None:
+    """A modulus near the end of its range, with noise that would reach beyond it."""
+    table = forces(of_law(0.02) + 6.0 * NOISE)
+    found = identify(table.model, [table], ["b"])
+    assert found["b"].interval[0] == 0.0
+    assert found["b"].identified
+    assert "95 % interval 0 to " in lines(found)
+    assert "cut off at the end of its range" in lines(found)
+    beyond = lines(identify(table.model, [forces(of_law(-0.2) + NOISE)], ["b"]))
+    assert "b = 0, without an interval\nnote: b is at the end of its range: the model may need a wider one" in beyond
 
 
 def test_residuals_below_the_models_own_error_are_not_doubted() -> None:

@@ -70,6 +70,23 @@ def test_a_known_shift_is_the_error_in_pixels_and_across_the_sight_line():
     assert figures["per_frame"]["24"]["max_px"] < 1e-6
 
 
+def test_tracks_that_count_from_another_frame_are_named():
+    """A sheet that moves faster and faster; at a constant speed other numbers explain nothing."""
+    run, accelerating = sliding_run(), STEP * np.arange(len(FRAMES)) ** 2
+    run.camera_from_object[:, 0, 3] = accelerating
+    pixels = projected()
+    pixels[:, :, 0] = 320.0 + 528.0 * (POINTS[:, 0] + accelerating[:, None]) / DEPTH
+    for shift, said in ((1, "one less"), (-1, "one more")):
+        (note,) = evaluate_pixels(run, tracks(pixels, FRAMES + shift))["notes"]
+        assert f"with {said} in each frame number of the tracks" in note
+        (note,) = evaluate_pixels(run, tracks(pixels, FRAMES + shift), bind_frame=22)["notes"]
+        assert f"with {said} in each frame number of the tracks" in note
+    assert evaluate_pixels(run, tracks(pixels))["notes"] == []
+    assert evaluate_pixels(sliding_run(), tracks(projected()))["notes"] == []
+    noisy = pixels + np.random.default_rng(2).normal(size=pixels.shape)
+    assert evaluate_pixels(run, tracks(noisy))["notes"] == []
+
+
 def test_pixels_are_those_of_the_image_as_recorded():
     """One radial term moves the second track by 3 px and more."""
     camera = md.Camera(640, 480, 528.0, 528.0, 320.0, 240.0, distortion=(-0.2, 0.0, 0.0, 0.0))

@@ -14,8 +14,8 @@ from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_depth
 from morph_dslam.evaluation.force import force_error, summarise_force
 from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
+from morph_dslam.evaluation.frame_numbers import point_notes, track_notes
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
-from morph_dslam.evaluation.point_notes import frame_notes
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.trajectory import summarise_alignment
@@ -51,7 +51,7 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
     figures = {
         **summarise(error),
         **summarise_alignment(error),
-        "notes": frame_notes(tracked, points, error),
+        "notes": point_notes(tracked, points, error),
         "truth": None if isinstance(truth, PointTruth) else str(truth),
         **_counts(tracked),
         "median_ms": float(np.nanmedian(tracked.frame_times)),
@@ -138,9 +138,11 @@ def evaluate_pixels(
         cannot be written to.
     """
     tracked = run if isinstance(run, Run) else load_run(run)
-    error = pixel_error(tracked, tracks if isinstance(tracks, PixelTracks) else load_tracks(tracks), bind_frame)
+    measured = tracks if isinstance(tracks, PixelTracks) else load_tracks(tracks)
+    error = pixel_error(tracked, measured, bind_frame)
     figures = {
         **summarise_pixels(error),
+        "notes": track_notes(tracked, measured, error, bind_frame),
         "tracks": None if isinstance(tracks, PixelTracks) else str(tracks),
         **_counts(tracked),
     }

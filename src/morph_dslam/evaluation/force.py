@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.force_curves import LEAST, ForceCurve
+from morph_dslam.evaluation.force_notices import ForceNotice, force_notices
+from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE
-from morph_dslam.model.stated_errors import largest_force_error
+from morph_dslam.model.stated_errors import force_error as stated_force_error, largest_force_error
 
 Array = NDArray[np.float64]
 #: Changes of a force below this share of it are rounding.
@@ -59,6 +61,12 @@ class ReactionInDirection:
     def direction(self) -> str:
         """As in reports: "x", "-z" and so on."""
         return ("-" if self.sign < 0.0 else "") + "xyz"[self.axis]
+
+    def rms_by_estimates(self, states: Array, covariances: Array) -> float:
+        """Standard deviation, root mean square over states (e, d), if their covariances are (e, d, d)."""
+        slopes = np.array([self.field.value_and_sensitivities(mu)[1][:, 0, self.axis] for mu in states])
+        variances = np.einsum("ed,edc,ec->e", slopes, covariances, slopes)
+        return float(np.sqrt(max(np.mean(variances), 0.0)))
 
     def following(self, along: Array, measured: Array) -> ReactionInDirection:
         """This reaction with its sign, if forces (e,) ``along`` its axis are compared with measured ones (e,)."""
@@ -127,6 +135,7 @@ class ForceError:
     factor_std : standard deviation of the factor, from what the fit leaves.
     left_out : tracked frames that the curve does not have, or not in its range.
     own_error : a smaller change of the model's force may be its own error; 0 if the model states none.
+    notices : what speaks against the measurement being that of the model's force.
     axis : factor from ``places`` to what a plot shows, and its label.
     """
 
@@ -142,6 +151,7 @@ class ForceError:
     factor_std: float
     left_out: tuple[int, ...]
     own_error: float = 0.0
+    notices: tuple[ForceNotice, ...] = ()
     axis: tuple[float, str] = (1.0, "frame")
 
     @property
@@ -178,7 +188,7 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
     rows, left_out = rows[kept], run.frames[rows[~kept]]
     compared, modelled, size = _modelled(run, rows, measured[kept], reaction)
     factor, offset, deviation = _fit(modelled, measured[kept], size)
-    return ForceError(
+    error = ForceError(
         support=compared.support,
         direction=compared.direction,
         curve=curve,
@@ -193,6 +203,36 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
         own_error=_own_error(run.model, compared.support),
         axis=_axis(run.model, curve.against),
     )
+    return replace(error, notices=_notices(run, rows, compared, error))
+
+
+def _notices(
+    run: Run, rows: NDArray[np.integer], compared: ReactionInDirection, error: ForceError
+) -> tuple[ForceNotice, ...]:
+    """What a reader must know of forces compared in rows of the run."""
+    every, count = np.flatnonzero(run.tracked), len(run.model.parameters)
+    along = compared.sign * _values(compared.field, run.parameters[every])[:, compared.axis]
+    stated = stated_force_error(run.model, compared.support)
+    own = (
+        0.0
+        if stated is None
+        else stated[0] * root_mean_square(np.linalg.norm(_values(compared.field, run.parameters[rows]), axis=1))
+    )
+    if run.covariances is not None:
+        covariances = run.covariances[rows, :count, :count]
+        own = float(np.hypot(own, compared.rms_by_estimates(run.parameters[rows], covariances)))
+    _, notices = force_notices(
+        error.curve.name,
+        error.factor,
+        error.places,
+        error.measured,
+        error.factor * error.modelled + error.offset,
+        np.column_stack([error.modelled, np.ones(len(rows))]),
+        own_rms=abs(error.factor) * own,
+        by_frame=(run.frames[every].astype(float), along) if error.curve.against == "frame" else None,
+        picture="force_evaluation.png",
+    )
+    return tuple(notices)
 
 
 def _axis(model: ReducedModel, against: str) -> tuple[float, str]:
@@ -332,13 +372,9 @@ def _fit(modelled: Array, measured: Array, size: float) -> tuple[float, float, f
     return factor, offset, float(np.sqrt(left @ left / max(len(left) - 2, 1) / spread))
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def summarise_force(error: ForceError) -> dict[str, Any]:
     """The figures of ``force_evaluation.json``, newtons, plain JSON."""
-    rms = _rms(error.residuals)
+    rms = root_mean_square(error.residuals)
     return {
         "support": error.support,
         "direction": error.direction,
@@ -351,9 +387,10 @@ def summarise_force(error: ForceError) -> dict[str, Any]:
         "rms_N": rms,
         "relative_rms": rms / max(float(np.ptp(error.measured)), 1e-300),
         "largest_N": float(np.abs(error.residuals).max()),
-        "rms_without_fit_N": _rms(error.modelled - error.measured),
+        "rms_without_fit_N": root_mean_square(error.modelled - error.measured),
         "change_of_model_N": float(np.ptp(error.modelled)),
         "own_error_of_model_N": error.own_error,
+        "notices": [notice.content() for notice in error.notices],
         "largest_measured_N": float(np.abs(error.measured).max()),
         "frames_compared": error.frames.tolist(),
         "tracked_frames_off_the_curve": list(error.left_out),
@@ -393,7 +430,12 @@ def force_remarks(figures: Mapping[str, Any]) -> list[str]:
         )
     if frames := figures["tracked_frames_off_the_curve"]:
         lines.append(f"{len(frames)} tracked frames are not on the curve and were not compared: {_some(frames)}")
-    return lines
+    return [*lines, *noticed(figures)]
+
+
+def noticed(figures: Mapping[str, Any]) -> list[str]:
+    """What speaks against measured forces being those of the model, in words."""
+    return [notice["text"] for notice in figures.get("notices", [])]
 
 
 def reaction_remark(figures: Mapping[str, Any]) -> str:

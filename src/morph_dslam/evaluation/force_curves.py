@@ -121,7 +121,12 @@ def _newtons(path: str | Path, column: str) -> float:
             f"{path}: column '{column}' ends in '{unit}', which is no unit of force that is known: give one of "
             f"{', '.join(FORCE_UNITS)}"
         )
-    return FORCE_UNITS.get(unit, 1.0)
+    return newtons_of(column)
+
+
+def newtons_of(column: str) -> float:
+    """Newtons in the unit of force that the name of a column ends in; 1 if it ends in none."""
+    return FORCE_UNITS.get(name_and_unit(column)[1], 1.0)
 
 
 def _place(path: str | Path, header: str, model: ReducedModel) -> tuple[str, float]:

@@ -305,7 +305,7 @@ def pixel_remarks(figures: Mapping[str, Any]) -> list[str]:
             f"{figures['n_tracks_bound_at_outline']} tracks missed the surface by up to "
             f"{figures['outline_tolerance_px']:g} px and were bound to its outline"
         )
-    return lines
+    return [*lines, *figures.get("notes", [])]
 
 
 def pixel_line(figures: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.depth import DepthError
-from morph_dslam.evaluation.force import ForceError
+from morph_dslam.evaluation.force import ForceError, noticed
 from morph_dslam.evaluation.model_summary import flatten, summarise_model
 from morph_dslam.evaluation.pixels import PixelError, pixel_remarks
 from morph_dslam.evaluation.points import MaterialError
@@ -272,7 +272,7 @@ def _force_section(folder: Path, figures: Mapping[str, Any]) -> Section:
         "frames compared": f"{len(figures['frames_compared'])} of {figures['n_frames']}",
     }
     plot = _pictures(folder, {"force_evaluation.png": f"Measured force ({figures['column']}) and the model's."})
-    return Section("Force", [Table.of(rows), *plot])
+    return Section("Force", [Table.of(rows), *_warnings(noticed(figures)), *plot])
 
 
 def _warnings(lines: Sequence[str]) -> list[Text]:

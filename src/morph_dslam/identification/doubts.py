@@ -1,93 +1,85 @@
-"""What shows that measurements are not of what the model describes: other units, another axis, another law."""
+"""What shows that forces are not those that the model describes: another unit, another axis, another law."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
 
 from morph_dslam.errors import IdentificationError
+from morph_dslam.evaluation.force_notices import ForceNotice, OtherSize, force_notices
+from morph_dslam.evaluation.likeness import Likeness
 from morph_dslam.identification.measurements import MeasuredForces
 
 Array = NDArray[np.float64]
-#: Forces that change by more than so many times as much as the model's, or less than its inverse, are others.
-MOST_FACTOR = 10.0
 #: Changes of a force below this share of it are rounding.
 ROUNDING = 1e-9
-#: How likely independent residuals may be as alike as those of which it is said.
-LEAST_PROBABILITY = 1e-3
 
 
-def root_mean_square(values: Array) -> float:
-    """Of any values, at least one."""
-    return float(np.sqrt(np.mean(values**2)))
+def size_factor(forces: MeasuredForces, predicted: Array) -> float | None:
+    """The factor of predictions (n,) that would fit best; None of those that do not change."""
+    modelled = predicted - predicted.mean() if forces.free_zero else predicted
+    size = float(modelled @ modelled)
+    if size <= (ROUNDING * float(np.abs(predicted).max())) ** 2 * len(predicted):
+        return None
+    return float(modelled @ forces.changes) / size
 
 
-def check_size(forces: MeasuredForces, predicted: Array) -> None:
+def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0) -> None:
     """Refuse forces that change by far more or less than predicted ones (n,), those that fit best.
+
+    ``moduli`` is the common factor of all moduli in the predictions.
 
     Raises
     ------
     IdentificationError
-        If a factor of the prediction that would fit is beyond `MOST_FACTOR`, or below its inverse.
+        If a factor of the prediction that would fit is that of `OtherSize`.
     """
-    modelled = predicted - predicted.mean() if forces.free_zero else predicted
-    size = float(modelled @ modelled)
-    if size <= (ROUNDING * float(np.abs(predicted).max())) ** 2 * len(predicted):
-        return
-    factor = float(modelled @ forces.changes) / size
-    if not 1.0 / MOST_FACTOR <= factor <= MOST_FACTOR:
+    factor = size_factor(forces, predicted)
+    if factor is not None and (other := OtherSize.of(forces.name, factor)):
+        of_model = OtherSize.of(forces.name, moduli * factor) or other
         raise IdentificationError(
-            f"{forces.name} changes by {factor:.3g} times what the model's force changes by, even with the parameters "
-            "that fit best: check the units of its columns and --reaction, or build the model with wider ranges"
+            f"{of_model.finding}, and nothing in the model's ranges explains it: check the units of its columns and "
+            "--reaction, or build the model with wider ranges"
         )
 
 
-@dataclass(frozen=True)
-class Likeness:
-    """Whether neighbouring residuals are alike.
-
-    Attributes
-    ----------
-    durbin_watson : 2 if they are independent, less if they are alike.
-    probability : of so small a value if they are independent.
-    rms : of what no change of the unknowns takes from the residuals.
-    """
-
-    durbin_watson: float
-    probability: float
-    rms: float
-
-
-def likeness(residuals: Array, slopes: Array) -> Likeness | None:
-    """Whether neighbours are alike among what a curve alone cannot fit, in the order of the curve.
-
-    Its distribution is nearly a beta distribution with the mean and variance that Durbin and Watson (1951) derived.
+def notices(
+    forces: MeasuredForces, predicted: Array, slopes: Array, model_rms: float, moduli: float | None
+) -> tuple[Likeness | None, list[ForceNotice]]:
+    """How alike neighbouring residuals are, and what must be known of forces beside predicted ones (n,).
 
     Parameters
     ----------
-    residuals : (n,).
-    slopes : (n, f) derivatives by the unknowns, among them a constant if an offset is.
-
-    Returns
-    -------
-    None of too few values, and of those that are fitted to rounding.
+    slopes : (n, f) derivatives by what was identified.
+    model_rms : root mean square of the model's own errors of the predictions.
+    moduli : the common factor of all moduli that is in the predictions; None where it was not identified.
     """
-    left, singular, _ = np.linalg.svd(slopes, full_matrices=False)
-    basis = left[:, singular > ROUNDING * singular.max(initial=0.0)]
-    own, free = residuals - basis @ (basis.T @ residuals), len(residuals) - basis.shape[1]
-    if free < 3 or not np.linalg.norm(own) > ROUNDING * np.linalg.norm(residuals):
-        return None
-    # The quadratic form is that of A = D'D, D first differences.
-    steps = np.diff(basis, axis=0)
-    first, second = steps.T @ steps, np.diff(steps, axis=0, prepend=0.0, append=0.0)
-    trace = 2.0 * (len(own) - 1) - float(np.trace(first))
-    squares = 2.0 * (3.0 * len(own) - 4.0) - 2.0 * float(np.sum(second**2)) + float(np.sum(first**2))
-    mean = trace / free
-    variance = 2.0 * (squares - trace * mean) / (free * (free + 2.0))
-    total = mean / 4.0 * (1.0 - mean / 4.0) / (variance / 16.0) - 1.0
-    value = float(np.sum(np.diff(own) ** 2) / np.sum(own**2))
-    probability = float(beta.cdf(value / 4.0, total * mean / 4.0, total * (1.0 - mean / 4.0)))
-    return Likeness(value, probability, root_mean_square(own))
+    factor = size_factor(forces, predicted)
+    # At an end of its range the factor has no slope.
+    scaled = predicted[:, None] if moduli is not None else np.empty((len(predicted), 0))
+    return force_notices(
+        forces.name,
+        None if factor is None else factor * (1.0 if moduli is None else moduli),
+        forces.places,
+        forces.values,
+        predicted,
+        np.hstack([slopes, scaled, np.ones((len(slopes), int(forces.free_zero)))]),
+        own_rms=float(np.hypot(model_rms, _rms_by_run(forces))),
+        by_frame=(forces.places, predicted) if forces.curve.against == "frame" else None,
+        picture="identification.png",
+    )
+
+
+def _rms_by_run(forces: MeasuredForces) -> float:
+    """What the errors of a run's estimates do to its forces by frame, N; 0 without any."""
+    run = forces.run
+    if run is None or run.covariances is None or forces.curve.against != "frame":
+        return 0.0
+    names, of_run = ([p.name for p in model.parameters] for model in (forces.model, run.model))
+    shared = [name for name in names if name in of_run]
+    to, at = (np.array([own.index(name) for name in shared]) for own in (names, of_run))
+    rows = [row for place in forces.places if (row := run.row(int(place))) is not None]
+    covariances = np.zeros((len(rows), len(names), len(names)))
+    covariances[:, to[:, None], to] = run.covariances[rows][:, at[:, None], at]
+    states = [forces.model.vector(dict(zip(shared, run.parameters[row, at].tolist(), strict=True))) for row in rows]
+    return forces.compared.rms_by_estimates(np.array(states), covariances)

@@ -18,7 +18,8 @@ from scipy.optimize import least_squares
 from scipy.stats import norm, qmc, t
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.identification.doubts import check_size, root_mean_square
+from morph_dslam.evaluation.likeness import root_mean_square
+from morph_dslam.identification.doubts import check_size
 from morph_dslam.identification.measurements import MeasuredForces, Measurement
 from morph_dslam.identification.prior import KnownValues
 from morph_dslam.model import Parameter, ReducedModel
@@ -45,7 +46,7 @@ class Estimate:
     value : that fits best.
     std : standard deviation.
     model_std : the part of it by the model's own errors.
-    interval : (2,), 95 %.
+    interval : (2,), 95 %, cut off at the ends of the range; at a bound it does not hold.
     at_bound : whether it is at an end of its range.
     wide : whether the interval is as wide as the range.
     """
@@ -75,6 +76,7 @@ class Misfit:
     adjustment : (n,) what that added.
     slopes : (n, f) derivatives by the unknowns that are not at an end of their range.
     model_rms : root mean square of the model's own errors of the predictions.
+    by_range : (k,) root mean square of what each unknown changes the predictions by over its whole range.
     """
 
     measurement: Measurement
@@ -82,6 +84,7 @@ class Misfit:
     adjustment: Array
     slopes: Array
     model_rms: float
+    by_range: Array
 
     @property
     def missed(self) -> Array:
@@ -185,7 +188,7 @@ def identify(
         # Only now, for the sign of a force may depend on what is identified.
         if isinstance(misfit.measurement, MeasuredForces):
             misfit.measurement.compared.check_growth(misfit.predicted, misfit.measurement.values)
-            check_size(misfit.measurement, misfit.predicted)
+            check_size(misfit.measurement, misfit.predicted, found[FACTOR].value if moduli else 1.0)
     return found
 
 
@@ -305,7 +308,7 @@ class _Fit:
                 float(value[i]),
                 float(slope[i] * std[i]),
                 float(slope[i] * np.sqrt(model[i])),
-                (float(low[i]), float(high[i])),
+                (max(float(low[i]), parameter.lower), min(float(high[i]), parameter.upper)),
                 bool(at_bound[i]),
                 bool(std[i] >= UNOBSERVABLE_SHARE),
             )
@@ -314,15 +317,27 @@ class _Fit:
 
     def _misfits(self, theta: Array, slopes: Array, errors: Array) -> tuple[Misfit, ...]:
         """With ``slopes`` (n, f) of the residuals and ``errors`` (e, n) of the model, in their units."""
-        found, begin = [], 0
-        for measurement, noise, (raw, predicted) in zip(
-            self._measurements, self._noise, self._predictions(theta), strict=True
+        found, begin, by_range = [], 0, self._by_range(theta)
+        for at, (measurement, noise, (raw, predicted)) in enumerate(
+            zip(self._measurements, self._noise, self._predictions(theta), strict=True)
         ):
             rows = slice(begin, begin + len(raw))
             size = root_mean_square(np.linalg.norm(errors[:, rows], axis=0))
-            found.append(Misfit(measurement, predicted, predicted - raw, noise * slopes[rows], noise * size))
+            of_model = noise * size
+            found.append(
+                Misfit(measurement, predicted, predicted - raw, noise * slopes[rows], of_model, by_range[:, at])
+            )
             begin = rows.stop
         return tuple(found)
+
+    def _by_range(self, theta: Array) -> Array:
+        """Root mean square changes (k, m) of the predictions of each measurement, over the range of each unknown."""
+        changes = np.zeros((len(theta), len(self._measurements)))
+        for i in range(len(theta)):
+            below, above = (np.where(np.arange(len(theta)) == i, end, theta) for end in (0.0, 1.0))
+            pairs = zip(self._predictions(below), self._predictions(above), strict=True)
+            changes[i] = [root_mean_square(high - low) for (_, low), (_, high) in pairs]
+        return changes
 
     def _model_errors(self, theta: Array) -> Array:
         """(e, n) of all measurements, in the units of their residuals; those of one unit have rows in common."""

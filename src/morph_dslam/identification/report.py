@@ -13,12 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.evaluation.force import SMALL_SHARE, reaction_remark
-from morph_dslam.identification.doubts import LEAST_PROBABILITY, likeness, root_mean_square
+from morph_dslam.evaluation.force import SMALL_SHARE, noticed, reaction_remark
+from morph_dslam.evaluation.likeness import root_mean_square
+from morph_dslam.identification.doubts import notices
 from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
 from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter
+from morph_dslam.units import FACTORS
 
 DPI = 110
 
@@ -26,11 +28,12 @@ DPI = 110
 def summarise(found: Identification) -> dict[str, Any]:
     """The content of ``identification.json``, parameters in their own units, plain JSON."""
     names = [each.parameter.name for each in found.estimates]
+    moduli = found[FACTOR].value if FACTOR in names else None
     rows = [dict(zip(names, row, strict=True)) for row in found.correlation.tolist()]
     return {
         "parameters": [_figures(each) for each in found.estimates],
         "correlation": dict(zip(names, rows, strict=True)),
-        "measurements": [_misfit_figures(misfit, names) for misfit in found.misfits],
+        "measurements": [_misfit_figures(misfit, names, moduli) for misfit in found.misfits],
         "groups": found.groups,
     }
 
@@ -51,7 +54,8 @@ def _figures(each: Estimate) -> dict[str, Any]:
     }
 
 
-def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]:
+def _misfit_figures(misfit: Misfit, identified: Sequence[str], moduli: float | None) -> dict[str, Any]:
+    """Those of one measurement; ``moduli`` is the common factor of all, if one was identified."""
     measurement = misfit.measurement
     known, scale = {*measurement.given, *identified}, measurement.scale
     figures = {
@@ -63,6 +67,7 @@ def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]
         "largest": scale * float(np.abs(misfit.missed).max()),
         "change_rms": scale * root_mean_square(measurement.changes),
         "model_error_rms": scale * misfit.model_rms,
+        "change_over_range_rms": dict(zip(identified, (scale * misfit.by_range).tolist(), strict=True)),
         "mesh_error_stated": measurement.mesh_error_stated,
         "at_default": [
             {"name": p.name, "unit": p.unit, "value": p.display(p.default)}
@@ -71,7 +76,7 @@ def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]
         ],
     }
     if isinstance(measurement, MeasuredForces):
-        return figures | _force_figures(misfit, measurement, identified)
+        return figures | _force_figures(misfit, measurement, identified, moduli)
     if isinstance(measurement, MeasuredPoints):
         figures["span_of_object"] = measurement.span
         moved = np.sqrt(3.0) * scale * root_mean_square(misfit.adjustment)
@@ -79,12 +84,13 @@ def _misfit_figures(misfit: Misfit, identified: Sequence[str]) -> dict[str, Any]
     return figures
 
 
-def _force_figures(misfit: Misfit, forces: MeasuredForces, identified: Sequence[str]) -> dict[str, Any]:
+def _force_figures(
+    misfit: Misfit, forces: MeasuredForces, identified: Sequence[str], moduli: float | None
+) -> dict[str, Any]:
     """Those that points do not have."""
     units = {p.name: p for p in forces.model.parameters}
     rates = [(n, rate) for n, rate in forces.loading_rates.items() if n not in identified]
-    order, zero = np.argsort(forces.places, kind="stable"), np.ones((len(forces.values), int(forces.free_zero)))
-    alike = likeness(misfit.missed[order], np.hstack([misfit.slopes, zero])[order])
+    alike, found = notices(forces, misfit.predicted, misfit.slopes, misfit.model_rms, moduli)
     figures = {
         "support": forces.compared.support,
         "direction": forces.compared.direction,
@@ -94,21 +100,22 @@ def _force_figures(misfit: Misfit, forces: MeasuredForces, identified: Sequence[
         "left_out": forces.left_out,
         "loading_rate_per_frame": {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates},
         "neighbours": None if alike is None else asdict(alike),
+        "notices": [notice.content() for notice in found],
     }
     figures |= {"why": f"they are {forces.why_left_out}"} if forces.left_out else {}
     return figures | ({"offset": misfit.offset} if forces.free_zero else {})
 
 
-#: Note what is missed by more than this part of what the load changed; smaller residuals than the other part of it
-#: are not looked at; points that lie within this part of the object.
-MOST_MISSED, LEAST_MISSED, LEAST_SPAN = 0.25, 1e-3, 0.05
+#: Note what is missed by more than this part of what the load changed; points that lie within this part of the object.
+MOST_MISSED, LEAST_SPAN = 0.25, 0.05
 #: Estimates that are more correlated than this, either way, are named.
 CORRELATED = 0.95
 
 
 def identification_lines(figures: Mapping[str, Any]) -> list[str]:
     """What was identified, and what a reader must know of it."""
-    said = [line for each in figures["parameters"] for line in _parameter_lines(each)]
+    measured = figures["measurements"]
+    said = [line for each in figures["parameters"] for line in _parameter_lines(each, measured)]
     names = list(figures["correlation"])
     for i, a in enumerate(names):
         for b in names[i + 1 :]:
@@ -117,28 +124,50 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
                     f"note: {a} and {b} are correlated by {figures['correlation'][a][b]:.3f}: what was measured tells "
                     "little more than a combination of them"
                 )
-    if figures["measurements"] and figures["groups"] < 3 * len(names):
+    if measured and figures["groups"] < 3 * len(names):
         said.append(
             f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
             "intervals are rough"
         )
-    said += [*_model_errors(figures), *_at_default(figures["measurements"], FACTOR in names)]
-    return said + [line for each in figures["measurements"] for line in _measurement_lines(each)]
+    said += [*_model_errors(figures), *_at_default(measured, FACTOR in names)]
+    return said + [line for each in measured for line in _measurement_lines(each)]
 
 
-def _parameter_lines(each: Mapping[str, Any]) -> list[str]:
+def _parameter_lines(each: Mapping[str, Any], measurements: Sequence[Mapping[str, Any]]) -> list[str]:
     (low, high), (lower, upper) = each["interval_95"], each["range"]
-    unit = "" if each["unit"] == "1" else f" {each['unit']}"
-    beyond = low <= lower and high >= upper
-    interval = "wider than its range," if beyond else f"{low:.4g} to {high:.4g}{unit}"
-    whole = f" {lower:.4g} to {upper:.4g}{unit}" if beyond else ""
-    said = [f"{each['name']} = {each['value']:.4g}{unit}, 95 % interval {interval}{whole}"]
+    name, unit = each["name"], "" if each["unit"] == "1" else f" {each['unit']}"
+    interval = f"95 % interval {low:.4g} to {high:.4g}{unit}"
+    if low <= lower and high >= upper:
+        interval = f"95 % interval wider than its range, {lower:.4g} to {upper:.4g}{unit}"
+    elif each["at_bound"]:
+        interval = "without an interval"
+    elif low <= lower or high >= upper:
+        interval += ", cut off at the end of its range"
+    said, weak = [f"{name} = {each['value']:.4g}{unit}, {interval}"], _weak(each, measurements)
     if each["at_bound"]:
-        advice = "" if each["as_wide_as_range"] else ": the model may need a wider one"
-        said.append(f"note: {each['name']} is at the end of its range{advice}")
+        advice = "" if each["as_wide_as_range"] or weak else ": the model may need a wider one"
+        if name == FACTOR:
+            advice = f", {lower:g} to {upper:g} for every model: check units, and the moduli of the model"
+        said.append(f"note: {name} is at the end of its range{advice}")
     if each["as_wide_as_range"]:
-        said.append(f"note: {each['name']} could not be identified: its interval is as wide as its range")
-    return said
+        said.append(f"note: {name} could not be identified: its interval is as wide as its range")
+    return said + weak
+
+
+def _weak(each: Mapping[str, Any], measurements: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Why a parameter was not identified, if over its whole range it changes less than what is missed anyway."""
+    name = each["name"]
+    changes = [(m, m["change_over_range_rms"][name]) for m in measurements]
+    if each["identified"] or not changes or any(change >= m["rms"] for m, change in changes):
+        return []
+    listed = " and ".join(
+        f"{m['name']} by {change:.2g} {m['unit']} rms, less than the {m['rms']:.2g} {m['unit']} that are missed"
+        for m, change in changes
+    )
+    advice = "measure something that depends on it more"
+    if each["unit"] in FACTORS["stress"] and not any("support" in m for m in measurements):
+        advice = "where supports prescribe displacements, shapes hardly depend on moduli; measure forces (--force)"
+    return [f"note: over its whole range {name} changes {listed}: they hardly determine it; {advice}"]
 
 
 def _model_errors(figures: Mapping[str, Any]) -> list[str]:
@@ -197,14 +226,7 @@ def _doubts(each: Mapping[str, Any]) -> list[str]:
             f"note: {name} covers {100.0 * share:.2g} % of the model's range of {each['against']}: is the unit in the "
             "name of its first column right?"
         )
-    alike, least = each.get("neighbours"), max(each["model_error_rms"], LEAST_MISSED * each["change_rms"])
-    if alike and alike["probability"] < LEAST_PROBABILITY and alike["rms"] > least:
-        said.append(
-            f"note: neighbouring residuals of {name} are alike (Durbin-Watson {alike['durbin_watson']:.2g}; 2 if "
-            "independent): the law, the loading or the support differs from the model's, which intervals do not "
-            "contain; see identification.png"
-        )
-    return said
+    return said + [f"note: {text}" for text in noticed(each)]
 
 
 def _at_default(measurements: Sequence[Mapping[str, Any]], scaled: bool) -> list[str]:

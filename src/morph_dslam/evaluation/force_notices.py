@@ -1,0 +1,157 @@
+"""What shows that measured forces are not those that a model describes: another unit, other frames, another law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.evaluation.force_curves import FORCE_UNITS, newtons_of
+from morph_dslam.evaluation.frame_numbers import HOW_FRAMES_COUNT, force_shift, in_words
+from morph_dslam.evaluation.likeness import Likeness, likeness, root_mean_square
+from morph_dslam.notices import Notice
+
+Array = NDArray[np.float64]
+#: Forces that change by more than so many times as much as the model's, or less than its inverse, are others. In the
+#: unit that is meant, they change as the model's do up to the other factor: its moduli may be wrong.
+MOST_FACTOR, ALIKE = 10.0, 2.0
+#: How likely independent residuals may be as alike as those of which it is said. Residuals below the last part of what
+#: the load changed are not looked at.
+LEAST_PROBABILITY, LEAST_MISSED = 1e-3, 1e-3
+
+
+@dataclass(frozen=True)
+class ForceNotice(Notice):
+    """Of measured forces.
+
+    Attributes
+    ----------
+    name : of their column.
+    """
+
+    name: str
+
+
+@dataclass(frozen=True)
+class OtherSize(ForceNotice):
+    """They change by far more or less than the model's.
+
+    Attributes
+    ----------
+    factor : by how many times as much.
+    unit : with which they would change as the model's do; empty if none is known.
+    factor_with_unit : by how many times as much then.
+    """
+
+    template: ClassVar[str] = (
+        "{finding}: check the unit in the title of its column, --reaction, and the moduli of the model"
+    )
+    factor: float
+    unit: str
+    factor_with_unit: float
+
+    @classmethod
+    def of(cls, name: str, factor: float) -> OtherSize | None:
+        """The notice of a factor, if it needs one."""
+        if not factor > 0.0 or 1.0 / MOST_FACTOR <= factor <= MOST_FACTOR:
+            return None
+        factors = {unit: factor * newtons / newtons_of(name) for unit, newtons in FORCE_UNITS.items()}
+        unit = min(factors, key=lambda unit: (abs(np.log(factors[unit])), len(unit)))
+        is_meant = 1.0 / ALIKE <= factors[unit] <= ALIKE
+        return cls(name, factor, unit if is_meant else "", factors[unit] if is_meant else factor)
+
+    @property
+    def finding(self) -> str:
+        """What it says, without what to do."""
+        other = f"; with values in {self.unit} it would be {self.factor_with_unit:.3g} times" if self.unit else ""
+        return f"{self.name} changes by {self.factor:.4g} times what the model's force changes by{other}"
+
+    @property
+    def text(self) -> str:
+        return self.template.format(finding=self.finding)
+
+
+@dataclass(frozen=True)
+class OtherFrameNumbers(ForceNotice):
+    """Other frame numbers explain most of what is left.
+
+    Attributes
+    ----------
+    shift : what each number lacks, -1 or 1.
+    factor : of the model's forces, with right numbers.
+    rms, rms_as_given : of what the factor and an offset leave with right numbers, and with those given, newtons.
+    """
+
+    template: ClassVar[str] = (
+        "with {shift} in each frame number of {name} a factor of {factor:.4g} and an offset leave {rms:.3g} N rms, not "
+        "{rms_as_given:.3g}: {how}"
+    )
+    shift: int
+    factor: float
+    rms: float
+    rms_as_given: float
+
+    @property
+    def text(self) -> str:
+        return self.template.format(**{**vars(self), "shift": in_words(self.shift), "how": HOW_FRAMES_COUNT})
+
+
+@dataclass(frozen=True)
+class NeighboursAlike(ForceNotice):
+    """Neighbouring residuals are alike.
+
+    Attributes
+    ----------
+    durbin_watson : 2 if they are independent, less if they are alike.
+    picture : that shows them.
+    """
+
+    template: ClassVar[str] = (
+        "neighbouring residuals of {name} are alike (Durbin-Watson {durbin_watson:.2g}; 2 if independent): the law, "
+        "the loading or the support differs from the model's, which no interval or deviation contains; see {picture}"
+    )
+    durbin_watson: float
+    picture: str
+
+
+def force_notices(
+    name: str,
+    factor: float | None,
+    places: Array,
+    measured: Array,
+    fitted: Array,
+    slopes: Array,
+    own_rms: float,
+    by_frame: tuple[Array, Array] | None,
+    picture: str,
+) -> tuple[Likeness | None, list[ForceNotice]]:
+    """How alike neighbouring residuals are, and what must be known of the forces.
+
+    Parameters
+    ----------
+    name : of the column of measured forces; its unit is at its end.
+    factor : by how many times as much they change as the model's; None if those do not change.
+    places : (n,) where on the curve they are.
+    measured : (n,) newtons.
+    fitted : (n,) the model's, as they fit best.
+    slopes : (n, f) derivatives of these by what was fitted.
+    own_rms : of what the model's own errors, and those of the estimates, do to its forces: smaller residuals tell
+        nothing.
+    by_frame : of forces by frame, frames (e,) of the run and the model's forces (e,) there.
+    picture : that shows the residuals.
+    """
+    order = np.argsort(places, kind="stable")
+    alike = likeness((fitted - measured)[order], slopes[order])
+    size = None if factor is None else OtherSize.of(name, factor)
+    found: list[ForceNotice] = [] if size is None else [size]
+    least = max(own_rms, LEAST_MISSED * root_mean_square(measured - measured.mean()))
+    if root_mean_square(fitted - measured) <= least:
+        return alike, found
+    shift = None if by_frame is None else force_shift(*by_frame, places, measured)
+    if shift is not None:
+        return alike, [*found, OtherFrameNumbers(name, shift.shift, shift.factor, shift.rms, shift.rms_as_given)]
+    if alike is not None and alike.probability < LEAST_PROBABILITY and alike.rms > least:
+        found.append(NeighboursAlike(name, alike.durbin_watson, picture))
+    return alike, found
