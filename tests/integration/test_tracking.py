@@ -21,7 +21,7 @@ from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.tracker_inputs import check_tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA, SheetFilm, mean_error, sheet_depth, sheet_state
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, mean_error, sheet_depth, sheet_state
 from tests.support.staged_scenes import aside
 
 
@@ -74,6 +74,23 @@ def test_points_behind_an_occluder_are_rejected_and_come_back(model, film):
         counts[step] = result.n_inliers
     assert min(counts[step] for step in range(3, 10)) < 0.85 * counts[2]
     assert counts[14] > 0.9 * counts[2]
+
+
+def test_what_moves_farther_than_it_is_followed_is_found_whole_and_not_said_to_be_covered(model):
+    """Fine speckles on a sheet that snaps through in a pose that holds: most of its points go 30 pixels and more."""
+    film = SheetFilm(model)
+    speckles = cv2.GaussianBlur(np.random.default_rng(5).standard_normal(film.texture.shape), (0, 0), 2.5)
+    film.texture = np.clip(128.0 + 60.0 * speckles / speckles.std(), 0.0, 255.0).astype(np.uint8)
+    pose = RigidTransform(rotation_exp(np.array([0.6, -0.15, 0.0])) @ UPRIGHT, np.array([0.0, 0.0, 0.65]))
+    heights = [0.0, 0.0, 0.025, 0.05, 0.03, -0.01, 0.05, -0.05]
+    arched = [State(np.array([height, 0.0, 0.0]), pose) for height in heights]
+    known = Registration(model, arched[0])
+    tracker = Tracker(model, CAMERA, known, TrackerOptions(pose="still"), reference=film.frame(arched[0]))
+    for truth in arched:
+        result = tracker.track(film.frame(truth))
+        assert (result.status, result.warnings) == ("tracked", ())
+        assert result.n_inliers > 0.9 * result.n_points
+        assert mean_error(model, result.estimate.state, truth) < 0.1e-3
 
 
 def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):

@@ -115,7 +115,7 @@ class FewPointsAgree(TrackingWarning):
     spread_px : robust spread of their residuals, pixels.
     """
 
-    template: ClassVar[str] = "few points agree, and less closely than usual: by {spread_px:.1f} px"
+    template: ClassVar[str] = "few points agree, and less closely than usual: by {spread_px:.2g} px"
     spread_px: float
 
 

@@ -18,6 +18,7 @@ from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
+from morph_dslam.tracking.patches import zero_where_unknown
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.state import Prior, State
 from morph_dslam.tracking.template_matching import matching_shifts
@@ -125,6 +126,18 @@ class Recovery:
     def partly_hidden(self, attempt: PoseHypothesis) -> bool:
         """Whether something else seems to be before the object."""
         return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
+
+    def brought_in_reach(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
+        """Compare once more in the state that was found, where few points agree and some were out of reach before."""
+        few = not agree(attempt, MOST_AGREE) or self.partly_hidden(attempt)
+        found, drawing = attempt.measurement, attempt.measurement.drawing
+        if not few or drawing is None or reject(attempt, self._options) is not None:
+            return attempt
+        state, missed = attempt.estimate.state, found.visible & ~attempt.inliers
+        moved = zero_where_unknown(self._reference.projected(state) - self._reference.projected(drawing.state))
+        if np.linalg.norm(moved[missed], axis=1).max(initial=0.0) < LARGEST_CORRECTION_PX:
+            return attempt
+        return self._estimation.correct(picture, state, None, attempt.prior)
 
     def unmistaken(self, picture: Image, attempt: PoseHypothesis) -> tuple[PoseHypothesis, Rejection | None]:
         """The attempt after a loss, or what explains the frame better in a place that looks alike; or why neither.

@@ -206,7 +206,7 @@ class Tracker:
             prior = self._predict(camera)
             followed = self._follow(image, prior)
             hypothesis = self._match(image, followed, prior)
-            hypothesis = self._search(hypothesis)
+            hypothesis = self._view.recovery.brought_in_reach(image, self._search(hypothesis))
             hypothesis = self._check_map(image, hypothesis, camera)
             hypothesis, found_by, rejection = self._gate(image, hypothesis)
             if rejection is not None:
@@ -336,6 +336,7 @@ class Tracker:
         if not rejected and not self._anchoring.contradicts(camera.pose_prior, hypothesis):
             return hypothesis
         free = self._match(image, self._follow(image, None), None)
+        free = self._view.recovery.brought_in_reach(image, free)
         return hypothesis if reject(free, self.options) is not None else free
 
     def _gate(self, image: Image, hypothesis: PoseHypothesis) -> tuple[PoseHypothesis, FoundBy, Rejection | None]:
