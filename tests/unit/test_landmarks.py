@@ -9,7 +9,15 @@ from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFai
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
 from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
-from morph_dslam.registration.messages import Ambiguity, Ambiguous, AtBound, FewLandmarks, Underdetermined
+from morph_dslam.registration.messages import (
+    Ambiguity,
+    Ambiguous,
+    AtBound,
+    FewLandmarks,
+    NotAtRest,
+    PoorFit,
+    Underdetermined,
+)
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
@@ -221,3 +229,24 @@ def test_an_object_at_rest_has_the_pose_that_opencv_finds():
     assert not found.covariance[:d].any()
     away = state.camera_from_object.translation - pose.translation
     assert (np.abs(away) < 4.0 * np.sqrt(np.diag(found.covariance)[d + 3 :])).all()
+
+
+def test_an_object_that_is_not_at_rest_is_named_with_what_the_landmarks_alone_give():
+    """Clicks of 0.5 px on a sheet that is arched by 25 mm."""
+    arched = landmarks(State(np.array([0.025, 0.0, 0.0]), POSE), noise=0.5)
+    (said,) = register_landmarks(MODEL, CAMERA, arched, at_rest=True).warnings
+    assert isinstance(said, NotAtRest)
+    name, value, unit = said.parameters.replace("=", "").split()
+    assert (name, float(value), unit) == ("arch", pytest.approx(25.0, abs=1.5), "mm")
+    assert said.free_px == pytest.approx(0.5, rel=0.4)
+    assert said.sigma_px > 2.0 * said.free_px
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_clicks_of_an_object_at_rest_do_not_accuse_it(seed):
+    """However inexact they are: three parameters explain a part of any clicks."""
+    exact = landmarks(State(np.zeros(3), POSE))
+    off = Landmarks(exact.points, exact.pixels + 2.0 * np.random.default_rng(seed).standard_normal((14, 2)))
+    (said,) = register_landmarks(MODEL, CAMERA, off, at_rest=True).warnings
+    assert type(said) is PoorFit
+    assert said.sigma_px == pytest.approx(2.0, rel=0.4)

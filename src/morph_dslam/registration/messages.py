@@ -95,10 +95,30 @@ class PoorFit(RegistrationWarning):
 
     template: ClassVar[str] = (
         "the landmarks fit to {sigma_px:.1f} px, where carefully set ones on an exact mesh fit to {expected_px:g} px: "
-        "the part and its drawing, or what else was given, differ by about as much; the stated deviations allow for it"
+        "the part and its drawing, or what else was given, differ by about as much; the stated deviations take that "
+        "for errors of single landmarks"
     )
     sigma_px: float
     expected_px: float
+
+
+@dataclass(frozen=True)
+class NotAtRest(PoorFit):
+    """The landmarks fit worse than carefully set ones, and the object is hardly at rest, as it was said to be.
+
+    Attributes
+    ----------
+    free_px : standard deviation of their pixels where the parameters are free.
+    parameters : what the landmarks alone give then, with units.
+    """
+
+    template: ClassVar[str] = (
+        "the landmarks fit to {sigma_px:.1f} px with the object at rest, and to {free_px:.1f} px with {parameters}: it "
+        "is probably not at rest in this frame, so leave out --at-rest. If it is, its dimensions are not those of the "
+        "mesh, or a landmark is wrong. The stated deviations contain none of that"
+    )
+    free_px: float
+    parameters: str
 
 
 @dataclass(frozen=True)
