@@ -151,6 +151,7 @@ PER_FRAME = [
     (TimeOutside("hold", "21 s", "0 to 20 s"), RunWarning.TIME_OUTSIDE),
     (KnownRefuted("arch", "3 mm", "5 mm", 7.0), RunWarning.KNOWN_REFUTED),
     (ModelDoesNotExplain(0.7), RunWarning.MODEL_FAILS),
+    (ModelDoesNotExplain(0.7, 5.0), RunWarning.SHIFTED),
     (CamerasDisagree(0.7), RunWarning.CAMERAS_DISAGREE),
     (CameraLost("too few points"), RunWarning.CAMERA_LOST),
     (CameraIgnored(1, Status.LOST), RunWarning.CAMERA_IGNORED),

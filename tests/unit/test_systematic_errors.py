@@ -20,6 +20,7 @@ from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estim
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import moved
+from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import FLOOR_PX, ReferenceMisfit, SystematicErrors, error_factors_of
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import measured
@@ -109,6 +110,26 @@ def test_what_neighbours_have_in_common_is_not_noise(model, estimator, pixels):
     by_model = errors.unexplained(replace(found, residuals=wave + 0.1 * noise), used)
     assert by_model.px == pytest.approx(1.0, abs=0.25)
     assert by_model.is_failure
+
+
+@pytest.mark.parametrize("still", [True, False])
+def test_a_camera_that_was_moved_is_told_from_another_model_by_the_one_shift_of_all_points(
+    model, estimator, pixels, still
+):
+    """The parameters take up a part of a shift, and a wave over the object has no shift in common."""
+    points, weights = bound(model, REFERENCE, pixels), np.ones(len(pixels))
+    parts = [BoundPart(slice(None), REFERENCE, None)]
+    errors = SystematicErrors(estimator, points, parts, WINDOW, still)
+    exact, noise = CAMERA.project(points.in_camera(LATER)), np.random.default_rng(2).standard_normal(pixels.shape)
+    pose = held(LATER, estimator)
+
+    def shift_of(seen):
+        return errors.common_shift(estimator.estimate(points, seen, weights, LATER, prior=pose), weights)
+
+    wave = np.column_stack([np.sin(pixels[:, 0] / 30.0), np.cos(pixels[:, 1] / 30.0)])
+    assert shift_of(exact + [3.0, -4.0] + 0.2 * noise) == (pytest.approx(5.0, rel=0.1) if still else 0.0)
+    assert shift_of(exact + 3.0 * wave + 0.2 * noise) == 0.0
+    assert shift_of(exact + 0.2 * noise) == 0.0
 
 
 def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):

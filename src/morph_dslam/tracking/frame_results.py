@@ -142,7 +142,8 @@ def _with_systematic_errors(
     if doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
     if left.is_failure:
-        warnings.append(ModelDoesNotExplain(left.px))
+        shift_px = systematic.common_shift(hypothesis.estimate, hypothesis.weights)
+        warnings.append(ModelDoesNotExplain(left.px, shift_px))
     if systematic.reference_factor > CLEARLY_WORSE:
         warnings.append(ReferenceWidened(systematic.reference_factor))
     return estimate, left.px, warnings

@@ -139,10 +139,13 @@ class ModelDoesNotExplain(TrackingWarning):
     Attributes
     ----------
     residual_px : root mean square of what they have in common, pixels.
+    shift_px : the one shift of all points that explains most of it, pixels, where the pose is one over the sequence; 0
+        if none does.
     """
 
     template: ClassVar[str] = "the model does not explain the images: {residual_px:.1f} px are left"
     residual_px: float
+    shift_px: float = 0.0
 
 
 @dataclass(frozen=True)

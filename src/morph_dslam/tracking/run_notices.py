@@ -72,7 +72,13 @@ class RunWarning(StrEnum):
     MODEL_FAILS = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
         "frames, first in frame {first}: there the object deforms otherwise, as by another law, support or shape, a "
-        "crack or a slip, or the camera is another one"
+        "crack or a slip, or the camera is another one, or, with --still, it or the support was moved"
+    )
+    SHIFTED = (
+        "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
+        "frames, first in frame {first}, mostly one shift of all points, by up to {shift_px:.1f} px: there the camera "
+        "or the support was moved, or a clamp slips, or else the object deforms otherwise, as by another law or shape; "
+        "track the frames before and after a move apart (--range), or leave out --still"
     )
     RIGID_FAILS = (
         "up to {largest_px:.1f} px that neighbouring points have in common are left in {count} of {n_frames} frames, "
@@ -218,8 +224,13 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
         largest = max(warning.deviations for _, warning in of_one)
         tell(of_one, kind.KNOWN_REFUTED, parameter=name, largest=largest)
     largest = float(np.nanmax(run.unexplained_px(), initial=0.0))
-    fails = kind.MODEL_FAILS if run.model.parameters else kind.RIGID_FAILS
-    tell(_warned(run, ModelDoesNotExplain), fails, largest_px=largest)
+    unexplained = _warned(run, ModelDoesNotExplain)
+    shifts = [warning.shift_px for _, warning in unexplained if warning.shift_px]
+    if 2 * len(shifts) > len(unexplained):
+        tell(unexplained, kind.SHIFTED, largest_px=largest, shift_px=max(shifts))
+    else:
+        fails = kind.MODEL_FAILS if run.model.parameters else kind.RIGID_FAILS
+        tell(unexplained, fails, largest_px=largest)
     apart = _warned(run, CamerasDisagree)
     tell(apart, kind.CAMERAS_DISAGREE, largest_px=max((warning.residual_px for _, warning in apart), default=0.0))
     return found

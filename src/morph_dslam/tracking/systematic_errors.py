@@ -193,6 +193,22 @@ class SystematicErrors:
         common = float(self._common.in_common(residuals[:, :, None], self._common.n_pairs(used))[0, 0])
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
+    def common_shift(self, estimate: Estimate, weights: Array) -> float:
+        """The one shift of all points, pixels, that with other parameters leaves less than half of the residuals; or 0.
+
+        It is looked for where one pose holds over the sequence: a free one takes it up. ``weights`` (p,) say which
+        points count.
+        """
+        if not self._still:
+            return 0.0
+        frame, d = self.linearized(estimate, weights), len(estimate.state.parameters)
+        left = frame.residuals[frame.usable].ravel()
+        by_parameters = (frame.jacobian * self._estimator.scale)[frame.usable, :, :d].reshape(-1, d)
+        columns = np.column_stack([by_parameters, np.tile(np.eye(2), (len(left) // 2, 1))])
+        found = np.linalg.lstsq(columns, left)[0]
+        explained = np.linalg.norm(left - columns @ found) < 0.5 * np.linalg.norm(left)
+        return float(np.linalg.norm(found[d:])) if explained else 0.0
+
     @property
     def reference_factor(self) -> float:
         """By how much larger than stated the reference's deviation is, as the frames so far show it."""
