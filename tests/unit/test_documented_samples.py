@@ -4,12 +4,13 @@ import tomllib
 from pathlib import Path
 
 import cv2
+import meshio
 import netgen.occ as occ
 import ngsolve as ngs
 import numpy as np
 import pytest
 
-from morph_dslam import make_study
+from morph_dslam import load_run, make_study
 from morph_dslam.errors import StudyError
 from morph_dslam.extend.reports import load_tracks
 from morph_dslam.io.camera_files import load_camera
@@ -163,6 +164,14 @@ def test_a_recording_of_your_own(tmp_path, monkeypatch):
     order = np.linalg.norm(tracks.pixels[0][:, None] - centres, axis=2).argmin(axis=1)
     expected = centres[order] + np.arange(5)[:, None, None] * [3.37, 0.0]
     assert np.abs(tracks.pixels - expected).max() < 0.1
+
+
+def test_an_exported_run_in_the_coordinates_of_the_world(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_model(Path("sheet.morph"), write_run(Path("run")))
+    exec(compile(samples("export", "python")[0], "export", "exec"), {})
+    found, run = meshio.read("in_world_0000.vtu"), load_run("run")
+    np.testing.assert_allclose(found.points, run.camera_points(0), atol=1e-7)
 
 
 def test_values_of_a_solids_study():
@@ -356,6 +365,7 @@ def test_every_program_is_run_by_a_test():
     counts = {page: len(samples(page, "python")) for page in pages}
     assert {page: count for page, count in counts.items() if count} == {
         "certificate": 1,
+        "export": 1,
         "materials": 1,
         "meshes": 1,
         "model-file": 2,

@@ -23,13 +23,29 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "values of a parameter, in its own unit; several make a grid (default: each in turn)",
         "NAME=FROM:TO:COUNT",
     )
-    add_file(command, "--path", "states from a table (docs/export.md)", "CSV")
+    add_file(
+        command, "--path", "states of the frames of a run, or of the rows of a table (docs/export.md)", "RUN_OR_CSV"
+    )
     add_repeated(command, "--at", "value of a parameter that is not varied (default: its default)", "NAME=VALUE")
+    command.add_argument(
+        "--coordinates",
+        choices=("object", "camera"),
+        default="object",
+        help="with --format vtu and the path of a run: camera puts the object where the camera saw it in each frame "
+        "(default: %(default)s)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import StateChoice, export
 
-    choice = StateChoice(arguments.vary, arguments.path, arguments.at)
-    target = export(arguments.model, arguments.output, arguments.format, choice, arguments.show)
+    choice = StateChoice(arguments.vary, arguments.path, arguments.at, arguments.coordinates)
+    target = export(
+        arguments.model,
+        arguments.output,
+        arguments.format,
+        choice,
+        arguments.show,
+        tell=lambda notice: print(f"note: {notice}"),
+    )
     print(f"wrote {target} and {arguments.output / 'states.csv'}")

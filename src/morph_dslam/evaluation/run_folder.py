@@ -15,6 +15,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError, check_kind
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.run_states import FORMAT, VERSION
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
 from morph_dslam.model.unknown_loads import with_unknown_loads
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from morph_dslam.tracking.result import FrameResult
 
 Array = NDArray[np.float64]
-FORMAT = "morph-dslam run"
-VERSION = 1
 #: More frames than these are not named one by one in messages.
 MOST_NAMED = 10
 

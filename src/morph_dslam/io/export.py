@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 from xml.etree import ElementTree
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from morph_dslam.errors import ExportError
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.interrupts import WaitingInterrupts
 from morph_dslam.io.gltf import GENERATOR, Colours, write_glb
 from morph_dslam.io.state_choice import EACH_IN_TURN, StateChoice, States, states_of_array
@@ -24,22 +25,24 @@ from morph_dslam.io.writing import removed_on_failure
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.shown_field import shown_field
+from morph_dslam.notices import Notice
 
 Array = NDArray[np.float64]
 FileFormat = Literal["xdmf", "vtu", "gltf"]
 
 
-def write_table(path: Path, model: ReducedModel, states: States, places: Sequence[dict[str, str | int]]) -> None:
+def write_table(path: Path, states: States, places: Sequence[dict[str, str | int]]) -> None:
     """The parameters of states as CSV, after the columns that say where each is and where it comes from.
 
     States that have no place, the last ones, were not written. The layout is that of tables of external solutions,
     so that a study can be made from an export.
     """
+    parameters = states.model.parameters
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow([*places[0], *states.origins[0], *(f"{p.name} [{p.unit}]" for p in model.parameters)])
+        writer.writerow([*places[0], *states.origins[0], *(f"{p.name} [{p.unit}]" for p in parameters)])
         for place, origin, mu in zip(places, states.origins, states.parameters, strict=False):
-            values = [f"{p.display(x):.9g}" for p, x in zip(model.parameters, mu, strict=True)]
+            values = [f"{p.display(x):.9g}" for p, x in zip(parameters, mu, strict=True)]
             writer.writerow([*place.values(), *origin.values(), *values])
 
 
@@ -78,6 +81,26 @@ def point_fields(model: ReducedModel, mu: Array) -> dict[str, ArrayLike]:
     if model.strain is not None:
         fields["strain"] = model.strain.value(mu)[:, _FULL_TENSOR]
     return {name: values.astype(np.float32) for name, values in fields.items()}
+
+
+def fields_of_state(states: States, state: int) -> tuple[Array, dict[str, ArrayLike]]:
+    """The undeformed nodes (n, 3) of a state, and its `point_fields` with what the shape has beyond the model's.
+
+    In the camera frame both are turned with the object, the nodes moved as well; stresses of sheets are those in the
+    axes of the material.
+    """
+    model = states.model
+    fields = point_fields(model, states.parameters[state])
+    moved = np.asarray(fields["displacement"]) + states.beyond_model(state, model.nodes)
+    if states.poses is None:
+        return model.nodes, fields | {"displacement": moved.astype(np.float32)}
+    pose = RigidTransform.from_matrix(states.poses[state])
+    fields["displacement"] = (moved @ pose.rotation.T).astype(np.float32)
+    for name in ("stress", "strain"):
+        if name in fields:
+            tensors = np.asarray(fields[name]).reshape(-1, 3, 3)
+            fields[name] = (pose.rotation @ tensors @ pose.rotation.T).reshape(-1, 9).astype(np.float32)
+    return pose.apply(model.nodes), fields
 
 
 def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock]:
@@ -123,23 +146,24 @@ def _beginning(path: Path, length: int = -1) -> str:
         return file.read(length)
 
 
-def write_vtu_series(folder: Path, stem: str, model: ReducedModel, states: States) -> Path:
+def write_vtu_series(folder: Path, stem: str, states: States) -> Path:
     """One ``stem_0000.vtu`` a state, ``stem.pvd`` to open all, ``states.csv``; returns the .pvd.
 
     An interrupt ends the series behind the state that is being written.
     """
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
-    cells, places, series = _cells(model), [], folder / f"{stem}.pvd"
+    cells, places, series = _cells(states.model), [], folder / f"{stem}.pvd"
     with WaitingInterrupts() as interrupts:
-        for i, mu in enumerate(tqdm(states.parameters, desc="states", unit="file")):
+        for i in tqdm(range(len(states)), desc="states", unit="file"):
             name = f"{stem}_{i:04d}.vtu"
-            meshio.Mesh(model.nodes, cells, point_data=point_fields(model, mu)).write(folder / name)
+            nodes, fields = fields_of_state(states, i)
+            meshio.Mesh(nodes, cells, point_data=fields).write(folder / name)
             ElementTree.SubElement(collection, "DataSet", timestep=f"{states.times[i]:.15g}", file=name)
             places.append({"file": name})
             if interrupts.is_waiting:
                 break
-        write_table(folder / "states.csv", model, states, places)
+        write_table(folder / "states.csv", states, places)
         ElementTree.indent(root)
         ElementTree.ElementTree(root).write(series, xml_declaration=True, encoding="utf-8")
     return series
@@ -154,7 +178,7 @@ class _SeriesWriter(TimeSeriesWriter):
         return self
 
 
-def write_xdmf_series(folder: Path, stem: str, model: ReducedModel, states: States) -> Path:
+def write_xdmf_series(folder: Path, stem: str, states: States) -> Path:
     """``stem.xdmf``, its data in ``stem.h5``, and ``states.csv``; returns the .xdmf.
 
     An interrupt ends the series behind the state that is being written.
@@ -162,23 +186,23 @@ def write_xdmf_series(folder: Path, stem: str, model: ReducedModel, states: Stat
     series, places = folder / f"{stem}.xdmf", []
     with WaitingInterrupts() as interrupts:
         with _SeriesWriter(series) as writer:
-            writer.write_points_cells(model.nodes, _cells(model))
-            for i, mu in enumerate(tqdm(states.parameters, desc="states", unit="state")):
-                writer.write_data(f"{states.times[i]:.15g}", point_data=point_fields(model, mu))
+            writer.write_points_cells(states.model.nodes, _cells(states.model))
+            for i in tqdm(range(len(states)), desc="states", unit="state"):
+                writer.write_data(f"{states.times[i]:.15g}", point_data=fields_of_state(states, i)[1])
                 places.append({"file": series.name, "step": i})
                 if interrupts.is_waiting:
                     break
-        write_table(folder / "states.csv", model, states, places)
+        write_table(folder / "states.csv", states, places)
     return series
 
 
-def _write_animation(folder: Path, stem: str, model: ReducedModel, states: States, show: Colours | None) -> Path:
+def _write_animation(folder: Path, stem: str, states: States, show: Colours | None) -> Path:
     """``stem.glb`` and ``states.csv``; returns the .glb. An interrupt leaves none of them, or both."""
     target = folder / f"{stem}.glb"
     with removed_on_failure(target):
-        write_glb(target, model, states.parameters, show)
+        write_glb(target, states, show)
         with WaitingInterrupts():
-            write_table(folder / "states.csv", model, states, [{"frame": i} for i in range(len(states))])
+            write_table(folder / "states.csv", states, [{"frame": i} for i in range(len(states))])
     return target
 
 
@@ -188,6 +212,7 @@ def export(
     file_format: FileFormat = "xdmf",
     choice: StateChoice | ArrayLike = EACH_IN_TURN,
     show: Colours | None = None,
+    tell: Callable[[Notice], object] = lambda notice: None,
 ) -> Path:
     """Write a model's states for ParaView or as an animation; returns the file to open.
 
@@ -200,7 +225,8 @@ def export(
     file_format : "xdmf" or "vtu" for ParaView, "gltf" for 3-D viewers.
     choice : of the states, by default each parameter in turn; or their parameters (s, d), SI.
     show : what colours a glTF file: "stress" (von Mises), "strain" (equivalent), "displacement", or "none"; by default
-        the stress of a model that has it, else the displacement.
+        the stress of a model that has it, else the displacement; of a run with a discrepancy this alone.
+    tell : called with each notice of what a reader of the states must know.
 
     Raises
     ------
@@ -219,19 +245,40 @@ def export(
         loaded, stem = model, _file_name(model.name)
     else:
         loaded, stem = load_model(model), Path(model).stem
-    states = choice.chosen(loaded) if isinstance(choice, StateChoice) else States.of(states_of_array(loaded, choice))
-    if show != "none":
-        shown_field(loaded, show)  # before a folder is made
+    if isinstance(choice, StateChoice):
+        states = choice.chosen(loaded)
+    else:
+        states = States.of(loaded, states_of_array(loaded, choice))
+    if states.poses is not None and file_format != "vtu":
+        raise ExportError("--coordinates camera needs --format vtu: other files hold the undeformed mesh once")
+    show = _shown(states, show) if file_format == "gltf" else None
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _remove_export(folder, stem)
         if file_format == "gltf":
-            return _write_animation(folder, stem, loaded, states, show)
-        write = write_xdmf_series if file_format == "xdmf" else write_vtu_series
-        return write(folder, stem, loaded, states)
+            target = _write_animation(folder, stem, states, show)
+        else:
+            target = (write_xdmf_series if file_format == "xdmf" else write_vtu_series)(folder, stem, states)
     except OSError as error:
         raise ExportError(f"cannot write to {folder}: {error.strerror or error}") from error
+    for notice in states.notices:
+        tell(notice)
+    return target
+
+
+def _shown(states: States, show: Colours | None) -> Colours | None:
+    """What colours a glTF file; raises if the model does not hold it, or the shapes do not go with it."""
+    if not states.discrepancies:
+        if show != "none":
+            shown_field(states.model, show)
+        return show
+    if show not in (None, "displacement"):
+        raise ExportError(
+            f"the run has a discrepancy, which neither modes nor stresses have: --show {show} cannot show its shapes; "
+            "leave it out, for colours by the displacement"
+        )
+    return "displacement"
 
 
 def _file_name(name: str) -> str:

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
+from morph_dslam.io.state_choice import States
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
 
@@ -78,14 +79,13 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def write_glb(path: Path, model: ReducedModel, states: Array, show: Colours | None = None) -> None:
-    """Write the surface of ``model`` along ``states`` (s, d); metres, z up in the object frame.
+def write_glb(path: Path, states: States, show: Colours | None = None) -> None:
+    """Write the surface of a model along states of it; metres, z up in the object frame.
 
     Parameters
     ----------
     path : of the file.
-    model : of the object.
-    states : (s, d) SI.
+    states : of the model.
     show : what colours it; by default the stress of a model that has it, else the displacement.
 
     Raises
@@ -95,11 +95,11 @@ def write_glb(path: Path, model: ReducedModel, states: Array, show: Colours | No
     ExportError
         If the file would be larger than glTF allows.
     """
-    buffer = _Buffer()
+    buffer, model = _Buffer(), states.model
     if show == "none" or not model.parameters:  # a rigid object has nothing to be coloured by
-        content = _modes(buffer, model, states)
+        content = _modes(buffer, model, states.parameters)
     else:
-        content = _coloured(buffer, model, states, shown_field(model, show))
+        content = _coloured(buffer, states, shown_field(model, show))
     document = {
         "asset": {"version": "2.0", "generator": f"{GENERATOR} {__version__}"},
         "scene": 0,
@@ -152,8 +152,9 @@ def _modes(buffer: _Buffer, model: ReducedModel, states: Array) -> dict[str, Any
     return content
 
 
-def _coloured(buffer: _Buffer, model: ReducedModel, states: Array, show: Shown) -> dict[str, Any]:
+def _coloured(buffer: _Buffer, states: States, show: Shown) -> dict[str, Any]:
     """A mesh a state, all but the first one hidden, and the animation that shows them in turn."""
+    model = states.model
     points, triangles = surface_points(model)
     rest, field = model.nodes[points.corners[:, 0]], ShownField(model, points, show)
     size = _VERTEX_BYTES * len(rest) * len(states)
@@ -162,8 +163,11 @@ def _coloured(buffer: _Buffer, model: ReducedModel, states: Array, show: Shown) 
             f"{len(states)} states of {len(rest)} coloured points take {size / 2**30:.1f} GB, and a glTF file has "
             "4 GB at most: choose fewer states, or --show none, which writes the modes"
         )
-    moved = [field.displacement(mu) for mu in tqdm(states, desc="states", unit="state")]
-    values = [field.values(mu, u) for mu, u in zip(states, moved, strict=True)]
+    moved = [
+        field.displacement(mu) + states.beyond_model(i, rest)
+        for i, mu in enumerate(tqdm(states.parameters, desc="states", unit="state"))
+    ]
+    values = [field.values(mu, u) for mu, u in zip(states.parameters, moved, strict=True)]
     _, top = field.range_of(values)
     # Positions are relative to the middle, and nodes stand there, so that hidden ones do not widen what is framed.
     nodes: list[dict[str, Any]] = [{"name": model.name, "rotation": _Z_UP, "children": []}]

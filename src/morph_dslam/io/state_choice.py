@@ -1,4 +1,4 @@
-"""Which states of a model an export has: along a path, on a grid, or a tour of all parameters.
+"""Which states of a model an export has: those of a run or a table, on a grid, or a tour of all parameters.
 
 Users give values in each parameter's own unit (that of `morph info`); arrays here are SI, (s, d) for s states of d
 parameters.
@@ -10,14 +10,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.errors import ExportError, StudyError
+from morph_dslam.io.run_states import RESULT, RunStates, load_run_states
 from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.unknown_loads import with_unknown_loads
+from morph_dslam.notices import Notice
 from morph_dslam.units import FACTORS, read_quantity, to_si
+
+if TYPE_CHECKING:
+    from morph_dslam.model.discrepancy import Discrepancy
 
 Array = NDArray[np.float64]
 #: States that one export may have: beyond, a grid was meant to be coarser.
@@ -100,50 +107,111 @@ def tour(model: ReducedModel, base: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class TakenFromResult(Notice):
+    """What the shapes have beside the parameters of a run's table was taken from the run's result.
+
+    Attributes
+    ----------
+    what : "unknown loads", "discrepancy", or both.
+    path : of the ``result.h5``.
+    """
+
+    template: ClassVar[str] = "{what} of the table's frames, which the table does not hold: taken from {path}"
+    what: str
+    path: str
+
+
+@dataclass(frozen=True)
+class StressWithoutDiscrepancy(Notice):
+    """Displacements have the discrepancy; stress and strain, which have none, are the model's."""
+
+    template: ClassVar[str] = (
+        "displacements have the run's discrepancy; stress and strain are the model's without it, for the shape with it "
+        "is not in equilibrium under the study's loads"
+    )
+
+
+@dataclass(frozen=True)
 class States:
     """States of a model.
 
     Attributes
     ----------
+    model : with the coefficients of its unknown loads among the parameters where the states have them.
     parameters : (s, d) SI.
     origins : of each the cells of ``states.csv`` that say where it comes from, by the column's title.
     times : (s,) seconds; the numbers of the states where they have no times.
+    discrepancies : of each state what its displacement has beyond the model's; empty where none has any.
+    poses : camera_from_object (s, 4, 4) where the states are wanted in the camera frame.
+    notices : what a reader of the states must know.
     """
 
+    model: ReducedModel
     parameters: Array
     origins: Sequence[dict[str, str]]
     times: Array
+    discrepancies: Sequence[Discrepancy | None] = ()
+    poses: Array | None = None
+    notices: tuple[Notice, ...] = ()
 
     @classmethod
-    def of(cls, parameters: Array) -> States:
+    def of(cls, model: ReducedModel, parameters: Array) -> States:
         """States that come from no table."""
-        return cls(parameters, [{}] * len(parameters), np.arange(len(parameters), dtype=np.float64))
+        return cls(model, parameters, [{}] * len(parameters), np.arange(len(parameters), dtype=np.float64))
 
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def beyond_model(self, state: int, positions: Array) -> Array | float:
+        """What the discrepancy adds to the displacement (n, 3) at positions (n, 3) of the undeformed object, metres."""
+        found = self.discrepancies[state] if self.discrepancies else None
+        return 0.0 if found is None else found.displacement(positions)
 
-def read_path(model: ReducedModel, path: Path, base: Array) -> States:
+    def with_run(self, run: RunStates, in_camera: bool) -> States:
+        """With the discrepancies of the same states of a run, and their poses where these are wanted."""
+        found = replace(self, poses=run.poses) if in_camera else self
+        if not run.has_discrepancy:
+            return found
+        notices = (*self.notices, StressWithoutDiscrepancy()) if self.model.stresses else self.notices
+        return replace(found, discrepancies=run.discrepancies, notices=notices)
+
+
+def read_run(model: ReducedModel, result: Path, in_camera: bool) -> States:
+    """The states of all frames that a run tracked, from its ``result.h5``, whole.
+
+    Raises
+    ------
+    ExportError
+        If the file cannot be read, the run is of another model, or tracked too many frames.
+    """
+    run = load_run_states(result)
+    loaded = run.model_with_loads(model.without_loads)
+    if len(run.frames) > MOST_STATES:
+        raise ExportError(f"{result} holds {len(run.frames)} states, and 1 to {MOST_STATES} can be exported")
+    origins = [{"from_frame": str(frame)} for frame in run.frames]
+    return States(loaded, run.parameters, origins, run.times).with_run(run, in_camera)
+
+
+def read_path(model: ReducedModel, path: Path, base: Array, in_camera: bool = False) -> States:
     """The states in the rows of a CSV table.
 
     A column is headed "name [unit]", as in the table of an export, or "name_unit", as in the ``frames.csv``
     of a run; the unit is any of the parameter's quantity. Other columns are passed over, and so are rows without
-    values: frames that were not tracked. Parameters without a column keep their value in ``base``.
+    values: frames that were not tracked. Parameters without a column keep their value in ``base``. What the run of a
+    table of frames found beside the parameters is taken from the ``result.h5`` beside it.
 
     Raises
     ------
     ExportError
         If the table cannot be read, a parameter's column has no unit, another quantity's, or a twin, no column is a
-        parameter's, or a value is no number in the range.
+        parameter's, or a value is no number in the range; or if a result beside it has more than parameters, and not
+        of the frames of the table.
     """
     if not model.parameters:
         raise ExportError(f"'{model.name}' has no parameters, and so one state only: leave --path out")
     (_, header), *rows = read_csv(path, "path", ExportError) or [(1, [])]
-    found = {k: _column_of(p, header, path) for k, p in enumerate(model.parameters)}
-    columns = {k: column for k, column in found.items() if column is not None}
-    if not columns:
-        wanted = ", ".join(f"'{p.name} [{p.unit}]'" for p in model.parameters)
-        raise ExportError(f"{path} has no column of a parameter; name the columns {wanted}")
+    model, columns = _columns(model, header, path)
+    base = np.concatenate([base, np.zeros(model.n_loads)])
     states, taken = [], []
     for line, row in rows:
         texts = {k: _cell(row, column) for k, (column, _) in columns.items()}
@@ -156,9 +224,56 @@ def read_path(model: ReducedModel, path: Path, base: Array) -> States:
         taken.append((line, row))
     if not 0 < len(states) <= MOST_STATES:
         raise ExportError(f"{path} holds {len(states)} states, and 1 to {MOST_STATES} can be exported")
-    found = States.of(np.array(states))
+    found = States.of(model, np.array(states))
     times = _times(header, [row for _, row in taken])
-    return replace(found, origins=_origins(header, taken), times=found.times if times is None else times)
+    found = replace(found, origins=_origins(header, taken), times=found.times if times is None else times)
+    return _with_result_beside(found, path, in_camera)
+
+
+def _columns(model: ReducedModel, header: Sequence[str], path: Path) -> tuple[ReducedModel, dict[int, tuple[int, str]]]:
+    """The column of each parameter, and its unit; with the model that has loads, if there are columns of these."""
+
+    def of(parameters: Sequence[Parameter]) -> dict[int, tuple[int, str]]:
+        found = {k: _column_of(p, header, path) for k, p in enumerate(parameters)}
+        return {k: column for k, column in found.items() if column is not None}
+
+    columns, d = of(model.parameters), len(model.parameters)
+    if not columns:
+        wanted = ", ".join(f"'{p.name} [{p.unit}]'" for p in model.parameters)
+        raise ExportError(f"{path} has no column of a parameter; name the columns {wanted}")
+    if model.unknown_loads is None or model.n_loads:
+        return model, columns
+    loaded = with_unknown_loads(model)
+    # The range of a coefficient is no limit: it goes by a work that differs from run to run.
+    loads = [replace(p, lower=-math.inf, upper=math.inf) for p in loaded.parameters[d:]]
+    of_loads = {d + k: column for k, column in of(loads).items()}
+    loaded = replace(loaded, parameters=(*model.parameters, *loads))
+    return (loaded, columns | of_loads) if of_loads else (model, columns)
+
+
+def _with_result_beside(states: States, path: Path, in_camera: bool) -> States:
+    """With what the result beside a table of frames has of these, if it has more than parameters."""
+    result = path.with_name(RESULT)
+    if "from_frame" not in states.origins[0] or not result.is_file():
+        return states
+    run, model = load_run_states(result), states.model
+    adds_loads = run.has_loads(model) and not model.n_loads
+    if not (adds_loads or run.has_discrepancy or in_camera):
+        return states
+    loaded, d = run.model_with_loads(model.without_loads), len(model.study_parameters)
+    run = run.take([_frame(origin["from_frame"], path) for origin in states.origins])
+    if adds_loads:
+        states = replace(states, model=loaded, parameters=np.hstack([states.parameters, run.parameters[:, d:]]))
+    what = ["unknown loads"] * adds_loads + ["discrepancy"] * run.has_discrepancy
+    if what:
+        states = replace(states, notices=(TakenFromResult(" and ".join(what), str(result)),))
+    return states.with_run(run, in_camera)
+
+
+def _frame(text: str, path: Path) -> int:
+    if not text.isdecimal():
+        raise ExportError(f"{path}: the frame '{text}' is no number, by which {path.with_name(RESULT)} has its state")
+    return int(text)
 
 
 def _cell(row: Sequence[str], column: int) -> str:
@@ -256,6 +371,9 @@ def states_of_array(model: ReducedModel, choice: ArrayLike) -> Array:
     return states
 
 
+Axes = Literal["object", "camera"]
+
+
 @dataclass(frozen=True)
 class StateChoice:
     """Which states of a model to export, in the parameters' units.
@@ -263,29 +381,48 @@ class StateChoice:
     Attributes
     ----------
     vary : texts "name=from:to:count"; several make a grid.
-    path : CSV table with a state in each row, instead.
+    path : a run folder, or its ``result.h5``, for the states of its frames; or a CSV table with a state in each row.
     at : texts "name=value" for parameters that are not varied.
+    coordinates : "camera" for the object where the camera of the run saw it, as only VTU files can have it.
     """
 
     vary: Sequence[str] = ()
     path: str | Path | None = None
     at: Sequence[str] = ()
+    coordinates: Axes = "object"
 
     def states(self, model: ReducedModel) -> NDArray[np.float64]:
-        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters."""
+        """The states (s, d), SI; with neither ranges nor a path, a tour of all parameters.
+
+        Those of a run with unknown loads have their coefficients behind the parameters.
+        """
         return self.chosen(model).parameters
 
     def chosen(self, model: ReducedModel) -> States:
-        """The states, and what the table of a path says of them."""
+        """The states, and what the table of a path, or a run, says of them."""
         twice = {text.partition("=")[0] for text in self.vary} & {text.partition("=")[0] for text in self.at}
         if twice:
             raise ExportError(f"'{min(twice)}' is both varied and fixed: leave out its --vary or its --at")
         if self.path is not None and self.vary:
             raise ExportError("--path and --vary both choose the states: give one of them")
+        if self.coordinates not in get_args(Axes):
+            raise ExportError(f"coordinates are those of the object or the camera, not '{self.coordinates}'")
+        in_camera = self.coordinates == "camera"
+        states = self._chosen(model, in_camera)
+        if in_camera and states.poses is None:
+            raise ExportError("--coordinates camera needs the poses of a run: give its folder with --path")
+        return states
+
+    def _chosen(self, model: ReducedModel, in_camera: bool) -> States:
         base = fixed_values(model, self.at)
-        if self.path is not None:
-            return read_path(model, Path(self.path), base)
-        return States.of(grid(model, self.vary, base) if self.vary else tour(model, base))
+        if self.path is None:
+            return States.of(model, grid(model, self.vary, base) if self.vary else tour(model, base))
+        path = Path(self.path)
+        if not path.is_dir() and path.suffix.lower() not in (".h5", ".hdf5"):
+            return read_path(model, path, base, in_camera)
+        if self.at:
+            raise ExportError(f"--at {self.at[0]} changes nothing: a run has all parameters; leave it out")
+        return read_run(model, path / RESULT if path.is_dir() else path, in_camera)
 
 
 #: The tour of all parameters.

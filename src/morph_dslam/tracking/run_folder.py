@@ -22,6 +22,7 @@ from morph_dslam.geometry import cross_matrix, rotation_log
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.folders import make_run_folder
 from morph_dslam.io.hdf5_writing import written_hdf5
+from morph_dslam.io.run_states import FORMAT, VERSION
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.io.writing import writing
 from morph_dslam.model import save_model
@@ -39,8 +40,6 @@ from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
 
 Array = NDArray[np.float64]
-FORMAT = "morph-dslam run"
-VERSION = 1
 
 
 class RunFolder:
