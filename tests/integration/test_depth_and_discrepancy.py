@@ -1,12 +1,16 @@
 """`morph track` with depth, and of a sheet that skews and twists with a model that can only arch."""
 
 import json
+import re
+import shutil
 
 import cv2
 import numpy as np
 import pytest
 
+from morph_dslam import open_live, open_source
 from morph_dslam.cli.app import main
+from morph_dslam.errors import SourceError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
@@ -120,6 +124,32 @@ def test_depth_puts_the_object_right_along_the_sight_line(recording, tmp_path):
     assert without > 1.0e-3
     assert with_depth < 0.35 * without
     assert '"depth_used": true' in (tmp_path / "with" / "summary.json").read_text()
+
+
+def test_depth_images_in_millimetres(recording, tmp_path, refused):
+    """As RealSense and Kinect cameras write them; read as 5000 values a metre they are a fifth of the distances."""
+    shutil.copytree(recording, tmp_path / "mm")
+    for path in (tmp_path / "mm" / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.rint(depth / 5.0).astype(np.uint16))
+    found = tracked_from(tmp_path / "mm", tmp_path / "run", "--depth", "--depth-per-metre", "1000")
+    as_written = tracked_from(recording, tmp_path / "as_written", "--depth")
+    assert along_the_sight_line(found) == pytest.approx(along_the_sight_line(as_written), abs=2e-4)
+    files = ["--model", recording / "sheet.morph", "--camera", recording / "camera.yaml"]
+    start = ["--landmarks", recording / "landmarks.csv", "-o", tmp_path / "none"]
+    said = refused("track", tmp_path / "mm", *files, *start, "--depth")
+    ratio = re.search(r"the measured ones are (\S+) times those", said)
+    assert float(ratio[1]) == pytest.approx(0.2, rel=0.05)
+    assert "correct --depth-per-metre, the scale of the depth images (5000 values a metre" in said
+    # Live and before it is tracked, it is read the same way.
+    with open_live(tmp_path / "mm", depth_per_metre=1000) as live:
+        depth = next(iter(live)).depth
+    np.testing.assert_allclose(depth, next(iter(open_source(recording))).depth, atol=6e-4)
+    assert "leave --depth-per-metre out" in refused(
+        "track", recording / "rgb", *files, *start, "--depth", "--depth-per-metre", 1000
+    )
+    with pytest.raises(SourceError, match="cannot have 0 values a metre"):
+        open_source(recording, depth_per_metre=0.0)
 
 
 def test_recording_without_depth_is_refused(recording, tmp_path, refused):

@@ -50,6 +50,7 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"other_cameras": (Path("aside"),), "tracker": TrackerOptions(use_discrepancy=True)}, "--discrepancy"),
         ({"other_cameras": (Path("aside"),), "tracker": TrackerOptions(use_unknown_loads=True)}, "--unknown-loads"),
         ({"tracker": TrackerOptions(use_discrepancy=True), "drawing": DrawOptions("stress")}, "not in equilibrium"),
+        ({"depth_per_metre": 1000.0}, "add --depth"),
         ({"refine_camera": ("radial",)}, "--still"),
         ({"refine_camera": ("centre",), "tracker": TrackerOptions(pose="still")}, "focal and radial"),
         ({"reference_frame": 3, **REGISTERED}, "--reference-frame"),

@@ -1,5 +1,7 @@
 """The reference state refined by other frames and by depth, against the truth."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -99,8 +101,17 @@ def test_depth_places_the_object_along_the_sight_line():
 def test_depth_of_something_else_is_refused():
     landmarks, pixels, start = by_landmarks(0)
     image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0)) + np.float32(0.3)
-    with pytest.raises(RegistrationError, match="is the depth registered to this camera"):
+    with pytest.raises(RegistrationError, match="Is the depth registered to this camera"):
         refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
+
+
+def test_depth_in_another_unit_is_refused_with_its_factor():
+    """Millimetres that are read as 5000 values a metre are a fifth of the distance."""
+    landmarks, pixels, start = by_landmarks(0)
+    image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0)) * np.float32(0.2)
+    with pytest.raises(RegistrationError, match=r"are 0\.\d+ times those.* correct --depth-per-metre") as refusal:
+        refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
+    assert float(re.search(r"are (\S+) times", str(refusal.value))[1]) == pytest.approx(0.2, rel=0.02)
 
 
 def test_residuals_that_are_known_to_few_digits_have_their_minimum_found():

@@ -75,6 +75,16 @@ def add_rate(command: argparse._ActionsContainer) -> None:
     )
 
 
+def add_depth_per_metre(command: argparse._ActionsContainer) -> None:
+    """Add ``--depth-per-metre V``."""
+    command.add_argument(
+        "--depth-per-metre",
+        type=positive_number,
+        metavar="V",
+        help="values a metre of the recording's depth images, 1000 for millimetres; 5000 by default",
+    )
+
+
 def positive_number(text: str) -> float:
     """A number above zero, not infinite."""
     try:

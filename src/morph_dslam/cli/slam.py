@@ -2,7 +2,15 @@
 
 import argparse
 
-from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_range, add_rate, frame_number, positive_number
+from morph_dslam.cli.arguments import (
+    add_depth_per_metre,
+    add_file,
+    add_flag,
+    add_output,
+    add_range,
+    add_rate,
+    frame_number,
+)
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
 TERMS = ("focal", "centre", "radial", "tangential", "readout")
@@ -52,12 +60,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "of a rolling shutter, or all of them first, and write camera.yaml into the run folder; may be repeated",
     )
     add_rate(command)
-    command.add_argument(
-        "--depth-per-metre",
-        type=positive_number,
-        metavar="V",
-        help="values a metre of the recording's depth images, 1000 for millimetres; 5000 by default",
-    )
+    add_depth_per_metre(command)
     add_flag(command, "--no-depth", "leave the depth images of the recording aside")
     add_flag(command, "--overwrite", "replace a run that is in the run folder")
     add_flag(command, "--no-video", "do not draw the video with tracked points")

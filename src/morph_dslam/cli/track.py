@@ -270,6 +270,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         first=first,
         last=last,
         fps=arguments.fps,
+        depth_per_metre=arguments.depth_per_metre,
         output=arguments.output,
         overwrite=arguments.overwrite,
         video=not arguments.no_video,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from morph_dslam.cli.arguments import (
+    add_depth_per_metre,
     add_file,
     add_flag,
     add_output,
@@ -101,6 +102,7 @@ def _add_measured(group: _Group) -> None:
     add_flag(group, "--outline", "let the object's outline count too, where it stands out from the background")
     add_flag(group, "--no-texture", "follow the object by its outline alone")
     add_flag(group, "--depth", "let the depth images of an RGB-D recording count too")
+    add_depth_per_metre(group)
     add_flag(
         group,
         "--one-view",

@@ -33,7 +33,6 @@ from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, with_t
 from morph_dslam.sources import FrameSource, open_source, open_stream
 from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream
-from morph_dslam.sources.recorded import RecordedFrames
 
 Array = NDArray[np.float64]
 DPI = 110
@@ -100,11 +99,8 @@ def run_slam(
         raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
     if refine and (map_path is not None or trajectory is not None):
         raise MapError("--refine-camera makes a new map: leave out --map and --trajectory")
-    one_or_two, stream = load_camera_or_pair(camera), open_stream(source, first, last, fps)
-    if depth_per_metre is not None:
-        if not isinstance(stream, RecordedFrames):
-            raise SourceError(f"{source} has no depth images: leave --depth-per-metre out")
-        stream = stream.with_depth_per_metre(depth_per_metre)
+    one_or_two = load_camera_or_pair(camera)
+    stream = open_stream(source, first, last, fps, depth_per_metre)
     with stream if isinstance(stream, LiveStream) else nullcontext(), only_writer(output):
         make_run_folder(output, overwrite, "trajectory.txt")
         known: Scene | Trajectory | ColmapModel | None = None

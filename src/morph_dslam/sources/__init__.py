@@ -42,7 +42,11 @@ def register_source(matches: Matches, open: Open) -> None:
 
 
 def open_stream(
-    source: str | Path, first: int | None = None, last: int | None = None, fps: float | None = None
+    source: str | Path,
+    first: int | None = None,
+    last: int | None = None,
+    fps: float | None = None,
+    depth_per_metre: float | None = None,
 ) -> FrameStream:
     """Open a recording as `open_source` does, or a camera: `webcam:0`, `/dev/video0`, or a URL such as `rtsp://address`.
 
@@ -60,6 +64,8 @@ def open_stream(
             stream = open_kind(path, first, last)
             if fps is not None:
                 stream = _with_rate(stream, fps)
+            if depth_per_metre is not None:
+                stream = _with_depth_per_metre(stream, depth_per_metre)
             return stream if open_kind in _BUILT_IN else _checked(stream, path)
     raise SourceError(
         f"there is no folder of images and no video at {path} (cameras are webcam:0, /dev/video0 or a URL)"
@@ -73,6 +79,15 @@ def _with_rate(stream: FrameStream, fps: float) -> FrameStream:
     if isinstance(stream, LiveStream):
         stream.close()
     raise SourceError(f"{stream.name} says the times of its frames itself: leave --fps out")
+
+
+def _with_depth_per_metre(stream: FrameStream, values: float) -> FrameStream:
+    """The same frames, whose depth images have so many values a metre; SourceError if there are none."""
+    if isinstance(stream, RecordedFrames):
+        return stream.with_depth_per_metre(values)
+    if isinstance(stream, LiveStream):
+        stream.close()
+    raise SourceError(f"{stream.name} has no depth images: leave --depth-per-metre out")
 
 
 def _checked(stream: FrameStream, path: Path) -> FrameStream:
@@ -89,7 +104,11 @@ def _checked(stream: FrameStream, path: Path) -> FrameStream:
 
 
 def open_source(
-    path: str | Path, first: int | None = None, last: int | None = None, fps: float | None = None
+    path: str | Path,
+    first: int | None = None,
+    last: int | None = None,
+    fps: float | None = None,
+    depth_per_metre: float | None = None,
 ) -> FrameSource:
     """Open a recording.
 
@@ -101,11 +120,12 @@ def open_source(
         ROS 1 or ROS 2 bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
     first, last : range of frame numbers, both included; open ends by default
     fps : frames a second of numbered images, which nothing else tells; 30 by default
+    depth_per_metre : values a metre of the depth images, 1000 for millimetres; as the layout has them by default
 
     Raises SourceError if the path is missing, holds no frames, or does not reach ``first`` or ``last``. While
     iterating: if a frame cannot be decoded, changes size, or the video ends early; all frames before it come first.
     """
-    stream = open_stream(path, first, last, fps)
+    stream = open_stream(path, first, last, fps, depth_per_metre)
     if isinstance(stream, LiveStream):
         stream.close()
         raise SourceError(f"{path} is live; a recording is needed here")
@@ -115,7 +135,11 @@ def open_source(
 
 
 def open_live(
-    source: str | Path, first: int | None = None, last: int | None = None, fps: float | None = None
+    source: str | Path,
+    first: int | None = None,
+    last: int | None = None,
+    fps: float | None = None,
+    depth_per_metre: float | None = None,
 ) -> LiveStream:
     """Open a camera, or a recording that plays as if it were live: frames that come too fast are dropped.
 
@@ -124,13 +148,15 @@ def open_live(
     source : `webcam:0` for the first webcam, `/dev/video0`, the URL of a camera on the network, or a recording
     first, last : range of frame numbers of a recording, both included
     fps : frames a second of numbered images, which nothing else tells; 30 by default
+    depth_per_metre : values a metre of a recording's depth images, 1000 for millimetres; as its layout has them by
+        default
 
     Raises
     ------
     SourceError
         If there is no such source, or it cannot be opened.
     """
-    stream = open_stream(source, first, last, fps)
+    stream = open_stream(source, first, last, fps, depth_per_metre)
     return stream if isinstance(stream, LiveStream) else PacedRecording(stream)
 
 

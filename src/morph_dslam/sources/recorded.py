@@ -110,8 +110,10 @@ class RecordedFrames:
     def with_depth_per_metre(self, values: float) -> RecordedFrames:
         """The same frames, whose depth images have so many values a metre.
 
-        Raises SourceError if they have none that belong to the colour pixels.
+        Raises SourceError if they have none that belong to the colour pixels, or this is no number above zero.
         """
+        if not values > 0.0 or not np.isfinite(values):
+            raise SourceError(f"depth images cannot have {values:g} values a metre: give 1000 for millimetres")
         if self._depth_scale is None or not self.has_registered_depth:
             raise SourceError(
                 f"{self.name} has no depth images that belong to the colour pixels: leave --depth-per-metre out"

@@ -138,6 +138,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         lambda run: run.drawing.show in ("stress", "strain") and any(p.tracker.use_discrepancy for p in run.objects),
         f"{NOT_IN_EQUILIBRIUM}: leave out --show, or --discrepancy",
     ),
+    (
+        lambda run: run.depth_per_metre is not None and not any(part.tracker.use_depth for part in run.objects),
+        "--depth-per-metre says how depth images are to be read, which do not count here: add --depth, or leave it out",
+    ),
     (lambda run: bool(run.other_cameras) and any(part.tracker.use_unknown_loads for part in run.objects), NO_LOADS),
     (
         lambda run: (

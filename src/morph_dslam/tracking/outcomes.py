@@ -271,7 +271,8 @@ class DepthNotUsed(TrackingWarning):
         """For people."""
         if self.ratio is None:
             return "no depth was measured on the object"
-        return f"depth does not count: it has the object at {self.ratio:.3g} times its distance; is it in metres?"
+        at = f"{self.ratio:.3g} times its distance"
+        return f"depth does not count: it has the object at {at}; is it in metres (--depth-per-metre)?"
 
 
 @dataclass(frozen=True)

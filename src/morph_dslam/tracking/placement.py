@@ -170,9 +170,9 @@ def new_anchor(placed: Sequence[PlacedObject]) -> Anchor | None:
     return Anchor.of(anchored, placed[0].camera) if anchored else None
 
 
-def frame_at(path: Path | str, number: int | None) -> Frame:
+def frame_at(path: Path | str, number: int | None, depth_per_metre: float | None = None) -> Frame:
     """A frame of a recording, the first one by default; raises SourceError if it is not there."""
-    for frame in open_source(path, number, number) if number is not None else open_source(path):
+    for frame in open_source(path, number, number, depth_per_metre=depth_per_metre):
         return frame
     raise SourceError(f"{path} holds no frame {number} to take as the reference")
 

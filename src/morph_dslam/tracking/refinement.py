@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.sources.recorded import DEPTH_SCALE
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
@@ -212,12 +213,15 @@ def refine_by_depth(
         seen = np.ones(len(points), dtype=bool)
         depths = PointDepths.sampled(image, places, seen, estimator.camera, sigma_px**2, sigma_at_1m)
         size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-        near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
-        depths = depths.only(near)
+        expected = points.in_camera(state)[:, 2]
+        ratio = depths.ratio_to(expected)
+        depths = depths.only(np.abs(depths.depths - expected) < LARGEST_DISTANCE * size)
         if depths.count < LEAST:
+            measured = "none was measured on it" if ratio is None else f"the measured ones are {ratio:.3g} times those"
             raise RegistrationError(
-                f"only {depths.count} of {len(points)} points on the object have a depth near the one that "
-                "the landmarks give: is the depth registered to this camera, and in its unit?"
+                f"only {depths.count} of {len(points)} points on the object have a depth near the one that the "
+                f"landmarks give; {measured}. Is the depth registered to this camera? If not, do that first; else "
+                f"correct --depth-per-metre, {DEPTH_SCALE}, or the landmarks"
             )
         found = estimator.estimate(
             points.joined(landmarks),

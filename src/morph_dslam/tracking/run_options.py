@@ -64,6 +64,7 @@ class TrackOptions(ObjectOptions):
     first : number of the first frame to track; by default that of the recording, or of the registration.
     last : number of the last frame to track; by default that of the recording.
     fps : frames a second of numbered images, which nothing else tells; 30 by default.
+    depth_per_metre : values a metre of the first camera's depth images; as its layout has them by default.
     reference_frame : number of the frame that landmarks and initializers belong to, the first one by default;
         of a registered object before several cameras one in which it is undeformed.
     reference_image : of a live run, the image that landmarks and initializers belong to; by default the first frame
@@ -90,6 +91,7 @@ class TrackOptions(ObjectOptions):
     first: int | None = None
     last: int | None = None
     fps: float | None = None
+    depth_per_metre: float | None = None
     reference_frame: int | None = None
     reference_image: Path | None = None
     click_px: float = CLICK_PX

@@ -156,26 +156,28 @@ def _with_first_frame(run: TrackOptions, objects: Sequence[TrackedObject]) -> Tr
 
 def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
     """The frames to track, and what gives reference frames."""
-    paths = (run.frames, *run.other_cameras)
+    recordings = [(run.frames, run.depth_per_metre), *((path, None) for path in run.other_cameras)]
 
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
-        return tuple(frame_at(path, run.first if number is None else number) for path in paths)
+        return tuple(frame_at(path, run.first if number is None else number, scale) for path, scale in recordings)
 
-    sources = [open_source(path, run.first, run.last, run.fps) for path in paths]
+    sources = [open_source(path, run.first, run.last, run.fps, scale) for path, scale in recordings]
     return (SynchronizedFrames(sources) if run.other_cameras else sources[0]), frames_at
 
 
 def _open_live(run: TrackOptions, stack: ExitStack) -> tuple[Source, FramesAt]:
     """The stream to track, and what gives its reference: an image, or its first frame."""
-    stream = stack.enter_context(open_live(run.frames, run.first, run.last, run.fps))
+    scale = run.depth_per_metre
+    stream = stack.enter_context(open_live(run.frames, run.first, run.last, run.fps, scale))
 
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
         if run.reference_image is not None:
             return (Frame(BEFORE_ALL, 0.0, read_image(run.reference_image, "the reference image")),)
         # A recording is not begun by that: it would play while everything is made ready.
-        for frame in open_stream(run.frames, run.first, run.last) if isinstance(stream, PacedRecording) else stream:
+        is_recorded = isinstance(stream, PacedRecording)
+        for frame in open_stream(run.frames, run.first, run.last, None, scale) if is_recorded else stream:
             return (frame,)
         raise SourceError(f"{run.frames} ended before the first frame")
 
