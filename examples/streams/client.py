@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+from websockets.sync.client import ClientConnection, connect
+
+#: Seconds that a stream is waited for which nobody sends yet, and between two attempts.
+PATIENCE, PAUSE = 10.0, 0.2
 
 
 def unpack(data: bytes) -> dict[str, Any]:
@@ -28,15 +34,48 @@ def unpack(data: bytes) -> dict[str, Any]:
     return head | {"arrays": arrays}
 
 
-def messages(address: str) -> Iterator[dict[str, Any]]:
+def connected(stack: ExitStack, address: str, patience: float = PATIENCE) -> ClientConnection:
+    """A connection to a stream, which the stack closes; `morph` may begin to listen after this program has started.
+
+    Raises
+    ------
+    ConnectionError
+        If nothing listens at the address within so many seconds, or there is no stream at it.
+    """
+    parts, end = urlsplit(address), time.monotonic() + patience
+    while True:
+        try:
+            url = f"ws://{parts.netloc}/stream?{parts.query}"
+            return stack.enter_context(connect(url, max_size=None, compression=None))
+        except OSError as error:
+            if time.monotonic() > end:
+                raise ConnectionError(
+                    f"nothing listens at {parts.netloc} ({error.strerror or error}): start `morph` with --stream ws, "
+                    "and give the address that it prints"
+                ) from error
+        except (InvalidHandshake, InvalidURI) as error:
+            raise ConnectionError(
+                f"there is no stream at this address ({error}): give the one that `morph` printed, with its token, in "
+                "quotes"
+            ) from error
+        time.sleep(PAUSE)
+
+
+def messages(address: str, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
     """The messages of a stream until it ends: the scene, then frames.
 
     Parameters
     ----------
     address : as `morph` printed it, with the token.
+    patience : how many seconds it is waited for.
+
+    Raises
+    ------
+    ConnectionError
+        As `connected` does.
     """
-    parts = urlsplit(address)
-    with connect(f"ws://{parts.netloc}/stream?{parts.query}", max_size=None, compression=None) as socket:
+    with ExitStack() as stack:
+        socket = connected(stack, address, patience)
         try:
             for data in socket:
                 message = unpack(data)
@@ -45,6 +84,15 @@ def messages(address: str) -> Iterator[dict[str, Any]]:
                 yield message
         except ConnectionClosed:
             return
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run a program; where there is no stream, one line says why, and the exit status is 2."""
+    try:
+        main()
+    except ConnectionError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(2) from None
 
 
 def main() -> None:
@@ -71,4 +119,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -16,7 +16,7 @@ import threading
 from typing import Any
 
 import numpy as np
-from client import messages
+from client import messages, run
 from numpy.typing import NDArray
 
 PORT = 18944
@@ -147,8 +147,14 @@ def main() -> None:
     parser.add_argument("address", help="that morph printed, with the token")
     parser.add_argument("--port", type=int, default=PORT, help="to listen at (default: %(default)s)")
     arguments = parser.parse_args()
-    relay(arguments.address, socket.create_server(("127.0.0.1", arguments.port)))
+    try:
+        server = socket.create_server(("127.0.0.1", arguments.port))
+    except OSError as error:
+        raise ConnectionError(
+            f"port {arguments.port} cannot be listened at ({error.strerror}): give another one with --port"
+        ) from error
+    relay(arguments.address, server)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -4,7 +4,9 @@ import http.client
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from dataclasses import replace
+from functools import partial
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -317,6 +319,28 @@ def test_a_token_may_be_kept_from_run_to_run(monkeypatch):
     monkeypatch.setenv("MORPH_STREAM_TOKEN", "short")
     with pytest.raises(StreamError, match="16 or more"):
         StreamSink(["ws:0"])
+
+
+def test_a_client_may_start_before_the_stream(monkeypatch):
+    monkeypatch.setenv("MORPH_STREAM_TOKEN", "kept-from-run-to-run")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    address = f"http://127.0.0.1:{port}/?token=kept-from-run-to-run"
+    with ExitStack() as stack, ThreadPoolExecutor() as pool:
+        early = pool.submit(client.connected, stack, address)
+        with StreamSink([f"ws:{port}"]):
+            assert early.result(20.0).remote_address == ("127.0.0.1", port)
+
+
+def test_a_client_without_a_stream_ends_with_one_line(publisher, capsys):
+    publisher.close()
+    for address, said in ((publisher.place, "nothing listens at"), ("nowhere", "there is no stream at this address")):
+        with pytest.raises(SystemExit) as ended:
+            client.run(partial(client.connected, ExitStack(), address, 0.0))
+        assert ended.value.code == 2
+        assert said in capsys.readouterr().err
+    with closing(WebSocketPublisher()) as other, pytest.raises(ConnectionError, match=r"401.*with its token"):
+        client.connected(ExitStack(), f"http://127.0.0.1:{other.port}/?token=wrong", 0.0)
 
 
 def test_frames_before_the_scene_are_refused(publisher, model):
