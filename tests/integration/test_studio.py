@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from morph_dslam import Board, Camera, load_study, save_model
@@ -108,6 +109,39 @@ def test_the_pages_are_whole_and_load_nothing_from_elsewhere(client):
     assert b"//" not in page.replace(b"<!doctype", b"")
     for name in ("server.py", "../app.py", "%2e%2e/app.py", "three/../index.html", "three/LICENSE"):
         assert client.ask("GET", f"/{name}")[0] == 404
+
+
+def test_a_repaired_surface_is_named(tmp_path):
+    ball = trimesh.creation.icosphere(2, radius=20.0)
+    trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False).export(tmp_path / "ball.obj")
+    with running_studio(tmp_path / "project") as server:
+        client = Client(server)
+        assert client.upload("object", "ball.obj", (tmp_path / "ball.obj").read_bytes()) == 200
+        surface = client.call("load_object", file="ball.obj", unit="mm")
+        assert surface["notes"] == ["the surface of ball.obj was repaired: 1 hole closed"]
+        ball.export(tmp_path / "ball.obj")
+        assert client.upload("object", "ball.obj", (tmp_path / "ball.obj").read_bytes()) == 200
+        assert client.call("load_object", file="ball.obj", unit="mm")["notes"] == []
+
+
+def test_a_camera_file_of_another_size_is_named_before_the_start(tmp_path):
+    with running_studio(tmp_path / "project") as server:
+        client = Client(server)
+        save_model(tmp_path / "project/model.morph", stretched_block_model())
+        text = "width: {}\nheight: {}\nfx: 600.0\nfy: 600.0\ncx: 319.5\ncy: 239.5\n"
+        assert client.upload("camera", "phone.yaml", text.format(1280, 960).encode()) == 200
+        assert client.state()["notes"]["camera"] is None  # of no recording yet
+        _, data = cv2.imencode(".png", np.zeros((480, 640, 3), np.uint8))
+        assert client.upload("frame", "000.png", data.tobytes()) == 200
+        state = client.state()
+        said = "the recording is 640x480 pixels but the camera file is for 1280x960"
+        assert state["notes"]["camera"].startswith(said)
+        assert state["done"]["camera"] is False
+        for refused in (client.refused("fit", pairs=[[0.0] * 5] * 4, at_rest=True), client.refused("track")):
+            assert refused.startswith(said)
+        assert client.upload("camera", "phone.yaml", text.format(640, 480).encode()) == 200
+        state = client.state()
+        assert (state["notes"]["camera"], state["done"]["camera"]) == (None, True)
 
 
 def test_faces_grow_up_to_an_angle(client, folder):

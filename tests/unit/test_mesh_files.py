@@ -357,10 +357,10 @@ def test_cubes_that_share_an_edge_bound_no_volume(tmp_path):
 @pytest.mark.parametrize(
     ("change", "repair"),
     [
-        (lambda faces: faces[1:], "1 holes closed"),
-        (lambda faces: np.vstack([faces, faces[:1]]), "1 double faces removed"),
-        (lambda faces: np.vstack([faces[:1, ::-1], faces[1:]]), "1 faces turned"),
-        (lambda faces: faces[:, ::-1], "1 parts turned inside out"),
+        (lambda faces: faces[1:], "1 hole closed"),
+        (lambda faces: np.vstack([faces, faces[:1]]), "1 double face removed"),
+        (lambda faces: np.vstack([faces[:1, ::-1], faces[1:]]), "1 face turned"),
+        (lambda faces: faces[:, ::-1], "1 part turned inside out"),
     ],
 )
 def test_flawed_surfaces_are_filled_to_the_volume_of_sound_ones_and_info_says_so(tmp_path, capsys, change, repair):

@@ -103,7 +103,7 @@ def test_command_states_the_repairs_and_info_repeats_them(tmp_path, capsys):
     assert main(["build", "--rigid", str(path), "--unit", "mm", "-o", str(tmp_path / "part.morph")]) == 0
     printed = capsys.readouterr().out
     assert " triangles, 1 x 1 x 1 mm" in printed
-    assert "repair: 1 holes closed" in printed
+    assert "repair: 1 hole closed" in printed
     assert main(["info", str(tmp_path / "part.morph")]) == 0
     assert "repairs: holes closed  1" in capsys.readouterr().out
 

@@ -83,7 +83,7 @@ def build_study(study: Path, output: Path, workers: int | None = None, curve: Pa
 
 
 def _build_rigid(arguments: argparse.Namespace) -> None:
-    from morph_dslam.extend.studies import build_rigid
+    from morph_dslam.extend.studies import build_rigid, repairs_in_words
 
     if arguments.unit is None:
         raise StudyError(f"say in which unit {arguments.rigid} was drawn: --unit {', '.join(LENGTH_UNITS)}")
@@ -94,7 +94,7 @@ def _build_rigid(arguments: argparse.Namespace) -> None:
         f"{1e3 * (high - low):.4g}" for low, high in zip(model.nodes.min(axis=0), model.nodes.max(axis=0), strict=True)
     )
     print(f"wrote {arguments.output}: rigid, {len(model.triangles)} triangles, {extent} mm")
-    for name, count in model.provenance["repairs"].items():
-        print(f"repair: {count} {name}")
+    for repair in repairs_in_words(model.provenance["repairs"]):
+        print(f"repair: {repair}")
     if not model.provenance["repairs"]:
         print("the surface is closed and needed no repair")

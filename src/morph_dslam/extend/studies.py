@@ -1,5 +1,7 @@
 """Studies as objects, their solved samples, and what solves and reads them."""
 
+from morph_dslam.meshing.mesh_notes import file_notes as file_notes
+from morph_dslam.meshing.surface_repair import repairs_in_words as repairs_in_words
 from morph_dslam.studies.build import build_warnings as build_warnings
 from morph_dslam.studies.executors import default_executor as default_executor
 from morph_dslam.studies.inner_structures import (

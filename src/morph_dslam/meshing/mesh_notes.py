@@ -14,6 +14,7 @@ from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.mesh_checks import described_extent
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.meshing.netgen_meshing import SURFACES, closed_surface, step_volume
+from morph_dslam.meshing.surface_repair import repairs_in_words
 from morph_dslam.surface_distances import distances_to_surface
 from morph_dslam.units import to_si
 
@@ -112,8 +113,7 @@ def _surface_notes(mesh: Mesh, path: Path, scale: float, size: float | None) -> 
     except StudyError:  # the file has changed since the mesh was made of it
         return
     if repairs:
-        done = ", ".join(f"{count} {name}" for name, count in repairs.items())
-        yield f"the surface of {path.name} was repaired: {done}"
+        yield f"the surface of {path.name} was repaired: {', '.join(repairs_in_words(repairs))}"
     if size is None:
         return
     found = surface_deviation(mesh, scale * surface.points, surface.triangles)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
+from collections.abc import Mapping
 
 import numpy as np
 import trimesh
@@ -69,6 +71,12 @@ def repaired_surface(points: Array, triangles: Indices) -> tuple[Array, Indices,
     repairs |= {"open edges left": int((counts == 1).sum()), "edges of more than two faces": int((counts > 2).sum())}
     vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     return vertices, faces, {name: count for name, count in repairs.items() if count}
+
+
+def repairs_in_words(repairs: Mapping[str, int]) -> list[str]:
+    """Each of the repairs of `repaired_surface` with its count, "1 hole closed"."""
+    one = re.compile(r"s\b")
+    return [f"{count} {one.sub('', name, count=1) if count == 1 else name}" for name, count in repairs.items()]
 
 
 def _same_points(points: Array) -> Indices:

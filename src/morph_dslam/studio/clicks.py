@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam import Camera, ReducedModel, Registration, load_camera, load_model, register_landmarks
-from morph_dslam.errors import RegistrationError, StudioError
+from morph_dslam.errors import CameraError, RegistrationError, StudioError
 from morph_dslam.explorer.server import BadRequest, ModelPages
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
@@ -74,6 +74,15 @@ def camera_facts(path: Path) -> dict[str, Any]:
         "distortion": list(camera.distortion),
         "lens": camera.lens_model,
     }
+
+
+def camera_problem(path: Path, width: int, height: int) -> str | None:
+    """Why a camera file is not of a recording with images of a size; None if it may be."""
+    try:
+        opened_camera(path).check_image(np.broadcast_to(np.uint8(0), (height, width)), "the recording")
+    except CameraError as error:
+        return str(error)
+    return None
 
 
 def model_facts(path: Path) -> dict[str, Any]:

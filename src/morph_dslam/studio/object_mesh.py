@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from morph_dslam.errors import StudioError
 from morph_dslam.extend.mechanics import Mesh, check_mesh, load_mesh, save_mesh
+from morph_dslam.extend.studies import file_notes
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.packing import packed
 
@@ -36,10 +37,12 @@ class _Outside:
     ----------
     mesh : in metres.
     faces : (f, 2) cell and local face number of the outer faces.
+    notes : sentences on how it was made of its file: what was repaired, how far it is off.
     """
 
     mesh: Mesh
     faces: Indices
+    notes: tuple[str, ...]
 
     @cached_property
     def corners(self) -> Indices:
@@ -91,7 +94,7 @@ def _outside(path: Path, unit: str, size: float | None, stamp: tuple[int, int]) 
             f"{path.name} is a mesh of a surface; the pages here make studies of solids. Write a study of a shell by "
             "hand (docs/shell-study.md)"
         )
-    return _Outside(mesh, mesh.boundary_faces())
+    return _Outside(mesh, mesh.boundary_faces(), tuple(file_notes(mesh, path, unit, size)))
 
 
 def _opened(path: Path, unit: str, size: float | None) -> _Outside:
@@ -102,7 +105,7 @@ def _opened(path: Path, unit: str, size: float | None) -> _Outside:
 def object_surface(path: Path, unit: str, size: float | None) -> bytes:
     """The outer surface: ``nodes`` (n, 3), ``triangles`` (t, 3), ``faces`` (t,) numbers of the face of each.
 
-    Facts are counts, the extent in millimetres, and the names of the file's own sets.
+    Facts are counts, the extent in millimetres, the names of the file's own sets, and notes on what was repaired.
 
     Parameters
     ----------
@@ -122,6 +125,7 @@ def object_surface(path: Path, unit: str, size: float | None) -> bytes:
         "extent_mm": (1e3 * np.ptp(mesh.nodes, axis=0)).tolist(),
         "sets": _own_sets(outside),
         "cell_sets": sorted(mesh.cell_sets),
+        "notes": list(outside.notes),
     }
     return packed(facts, nodes=mesh.nodes[used], triangles=corners.reshape(-1, 3), faces=faces)
 

@@ -95,13 +95,13 @@ class Steps:
     async def state(self) -> dict[str, Any]:
         """The files of the project, what was chosen, what each step has, and the job."""
         has, project = self.project.has, self.project
-        problem = await self._run_problem()
+        problem, wrong_camera = await self._run_problem(), await self._camera_problem()
         is_tracked = has(f"{names.RUN}/summary.json") and problem is None
         done = {
             "object": has(names.MESH),
             "study": has(names.STUDY) and not (await self.study())["problems"],
             "build": has(names.MODEL),
-            "camera": has(names.CAMERA) and self.project.recording is not None,
+            "camera": has(names.CAMERA) and self.project.recording is not None and wrong_camera is None,
             "start": self.scan.is_accepted if self.scan.is_chosen else has(names.LANDMARKS),
             "track": is_tracked,
             "results": is_tracked,
@@ -113,7 +113,7 @@ class Steps:
             "done": done,
             "job": self._jobs.content(),
             "phone": self.phone_address(),
-            "notes": {"settings": project.damage, "start": project.aside, "run": problem},
+            "notes": {"settings": project.damage, "start": project.aside, "run": problem, "camera": wrong_camera},
         }
         for name, path, read in (
             ("camera", names.CAMERA, clicks.camera_facts),
@@ -323,6 +323,23 @@ class Steps:
         """A frame of the recording."""
         return await self._worker.call(recording.frame_jpeg, self._recording(), number)
 
+    async def _camera_problem(self) -> str | None:
+        """Why the camera file is not that of the recording; None if it may be, or if either is not there."""
+        name = self.project.recording
+        if name is None or not (self.project.has(name) and self.project.has(names.CAMERA)):
+            return None
+        try:
+            facts = await self._worker.call(recording.recording_facts, self.project.path(name))
+            camera = self.project.path(names.CAMERA)
+            return await self._worker.call(clicks.camera_problem, camera, facts["width"], facts["height"])
+        except StudioError:
+            return None  # one of them cannot be read, which is said of it
+
+    async def _check_camera(self) -> None:
+        problem = await self._camera_problem()
+        if problem is not None:
+            raise StudioError(problem)
+
     async def guess_camera(self, photo: Name) -> dict[str, Any]:
         """Write a camera file with the focal length of a photograph."""
         facts = await self._worker.call(recording.recording_facts, self._recording())
@@ -358,6 +375,7 @@ class Steps:
     async def fit(self, pairs: Pairs, at_rest: bool, quick: bool = False) -> bytes:
         """The object placed by pairs, with its overlay and the errors; quick ones start from the last fit."""
         model, camera = self._model_and_camera()
+        await self._check_camera()
         return await self._worker.call(clicks.fit_clicks, model, camera, pairs, at_rest, quick)
 
     def _model_and_camera(self) -> tuple[Path, Path]:
@@ -382,6 +400,7 @@ class Steps:
         """Start `morph track`, which begins the frame log anew when it has read what it needs."""
         self._jobs.check_idle()
         self._model_and_camera()
+        await self._check_camera()
         words = ["track", self._recording().name, "--model", names.MODEL, "--camera", names.CAMERA]
         words += self.scan.track_words() if self.scan.is_chosen else self._pairs_words(refine, snap)
         words += ["--outline"] if outline else []

@@ -101,9 +101,7 @@ export async function cameraStep(app) {
         ['Focal length', `${digits(one.fx)}, ${digits(one.fy)} px`], ['Centre', `${digits(one.cx)}, ${digits(one.cy)} px`],
         ['Distortion', one.distortion.length ? one.distortion.map((k) => digits(k, 3)).join(', ') : 'none']]));
       if (state.choices.camera_note) camera.append(el('p', { className: 'warning note' }, state.choices.camera_note));
-      if (found && !found.message && (found.width !== one.width || found.height !== one.height)) {
-        camera.append(el('p', { className: 'problem' }, 'The camera file is for images of another size than the recording\'s.'));
-      }
+      if (state.notes.camera) camera.append(el('p', { className: 'problem' }, state.notes.camera));
       camera.append(command('writes camera.yaml'));
     }
   }

@@ -93,6 +93,7 @@ export async function objectStep(app) {
     place.replaceChildren(...there([
       facts([['File', chosen.object], ['Size', `${surface.extent_mm.map((x) => digits(x)).join(' × ')} mm`],
         ['Cells', `${surface.n_cells} ${surface.cells.join(', ')}`], ['Nodes', String(surface.n_nodes)]]),
+      ...surface.notes.map((note) => el('p', { className: 'warning note' }, note)),
       el('div', { className: 'row' }, field('Unit of the file', unit),
         SURFACES.test(chosen.object) ? field('Cell size, mm', size) : null),
       el('h3', {}, 'Sets of faces'),
