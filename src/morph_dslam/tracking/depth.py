@@ -9,6 +9,7 @@ Elberink, Sensors 2012). Huber's cost is that of single numbers, so that a wrong
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -90,6 +91,14 @@ class PointDepths:
         """Variance of the residuals (p,): as taken for granted, or what they show if that is more."""
         bounded = np.clip(residuals, -self.huber_px, self.huber_px)
         return max(self.squared_px, float(np.sum(bounded**2)) / max(self.count, 1))
+
+    def bounded(self, residuals: Array) -> Array:
+        """Residuals (p,) whose squares are twice Huber's cost's weighted squares: large ones by their root."""
+        return residuals * np.sqrt(np.minimum(1.0, self.huber_px / np.maximum(np.abs(residuals), 1e-12)))
+
+    def take(self, rows: NDArray[Any]) -> PointDepths:
+        """Those of some points."""
+        return PointDepths(self.depths[rows], self.weights[rows], self.squared_px, self.huber_px)
 
     def only(self, kept: NDArray[np.bool_]) -> PointDepths:
         """These, without what is not ``kept`` (p,)."""

@@ -94,6 +94,11 @@ class PoseHypothesis:
     n_absent: int = 0
 
     @property
+    def point_depths(self) -> PointDepths | None:
+        """The depths (p,) of the reference view's points, without those of an outline; None if there are none."""
+        return None if self.depths is None else self.depths.take(np.arange(len(self.inliers)))
+
+    @property
     def outline_alone(self) -> bool:
         """Whether it was made from the outline, without any texture."""
         return not len(self.inliers) and self.outline is not None

@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.model import ReducedModel
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, State
 from morph_dslam.tracking.state import pose_increment
 
@@ -32,10 +35,56 @@ class LandmarkTerm:
     recorded: Array
     sigma_px: float
 
+    def away(self, camera: Camera, state: State) -> Array:
+        """How far the landmarks are from their pixels (k, 2), in standard deviations."""
+        away = camera.project(self.points.in_camera(state)) - camera.undistort_pixels(self.recorded)
+        return np.nan_to_num(away / self.sigma_px, nan=UNSEEN)
+
     def residuals(self, camera: Camera, state: State) -> Array:
         """(2 k,) in standard deviations."""
-        away = camera.project(self.points.in_camera(state)) - camera.undistort_pixels(self.recorded)
-        return np.nan_to_num(away / self.sigma_px, nan=UNSEEN).ravel()
+        return self.away(camera, state).ravel()
+
+
+@dataclass(frozen=True)
+class DepthTerm:
+    """What the depth image of the reference frame says of the reference state.
+
+    Attributes
+    ----------
+    model : the object.
+    recorded : (p, 2) pixels as recorded.
+    depths : measured there, of weights in standard deviations.
+    share : of each residual that counts, as neighbours err alike.
+    """
+
+    model: ReducedModel
+    recorded: Array
+    depths: PointDepths
+    share: float = 1.0
+
+    def residuals(self, camera: Camera, state: State) -> Array:
+        """(p,) in standard deviations; 0 where a pixel does not see the object."""
+        view, pixels = view_of(self.model, camera, state), camera.undistort_pixels(self.recorded)
+        surface, met = bind_pixels(self.model, camera, view, pixels)
+        seen, found = self.depths.take(met), np.zeros(len(pixels))
+        found[met] = self.share * seen.bounded(seen.terms(BoundPoints.from_surface(self.model, surface), state)[3])
+        return found
+
+
+@dataclass(frozen=True)
+class LandmarkDepthTerm(LandmarkTerm):
+    """What landmarks and a depth image of the same frame say of the reference state.
+
+    Attributes
+    ----------
+    depth : of the depth image.
+    """
+
+    depth: DepthTerm
+
+    def residuals(self, camera: Camera, state: State) -> Array:
+        """(2 k + p,) in standard deviations."""
+        return np.concatenate([super().residuals(camera, state), self.depth.residuals(camera, state)])
 
 
 @dataclass(frozen=True)

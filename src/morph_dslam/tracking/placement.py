@@ -54,6 +54,7 @@ class PlacedObject:
     in_sequence : whether the frames to track begin with it.
     seen : by camera, where (h, w) the reference frame shows the object; None for all that it covers.
     keyframes : by camera, other images of the object as it is there; None where only the reference is known.
+    depth : (h, w) of the first camera's reference frame, metres, NaN where unknown; None where it does not count.
     """
 
     object: TrackedObject
@@ -64,6 +65,7 @@ class PlacedObject:
     in_sequence: bool = False
     seen: tuple[NDArray[np.bool_] | None, ...] = ()
     keyframes: tuple[KeyframeViews, ...] | None = None
+    depth: NDArray[np.float32] | None = None
 
     @property
     def name(self) -> str:
@@ -201,7 +203,8 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and number in (None, run.first)
     placed = with_loads(registration, part.options)
-    return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence)
+    depth = frames[0].depth if part.options.use_depth else None
+    return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence, depth=depth)
 
 
 def with_loads(registration: Registration, options: TrackerOptions) -> Registration:

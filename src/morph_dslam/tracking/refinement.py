@@ -22,7 +22,7 @@ from morph_dslam.sources.recorded import DEPTH_SCALE
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
-from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
+from morph_dslam.tracking.known_state import DepthTerm, LandmarkTerm, StateTerm
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
@@ -42,6 +42,7 @@ class Keyframe:
     sigma_px : robust standard deviation of the residuals in it.
     outline : where the outline was seen, if it was looked for: it ties the texture to the object's edges.
     recorded : (p, 2) where a rolling shutter shows what is at ``pixels`` at the middle row's instant; None if the same.
+    depths : (p,) of the points, where a depth camera saw them; None without one.
     """
 
     pixels: Array
@@ -50,6 +51,7 @@ class Keyframe:
     sigma_px: float
     outline: OutlineMeasurement | None = None
     recorded: Array | None = None
+    depths: PointDepths | None = None
 
     def measured(self, points: BoundPoints, met: NDArray[np.bool_]) -> tuple[BoundPoints, Array, Array, Array]:
         """All that was measured, of ``points`` (those of the reference view that ``met``) and of the outline.
@@ -209,18 +211,16 @@ def refine_by_depth(
     """
     found = None
     for _ in range(ROUNDS):
-        points, places = _surface_in_view(estimator, state)
-        seen = np.ones(len(points), dtype=bool)
-        depths = PointDepths.sampled(image, places, seen, estimator.camera, sigma_px**2, sigma_at_1m)
-        size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-        expected = points.in_camera(state)[:, 2]
-        ratio = depths.ratio_to(expected)
-        depths = depths.only(np.abs(depths.depths - expected) < LARGEST_DISTANCE * size)
+        points, places, measured, near = _depths_in_view(estimator, state, image, sigma_px**2, sigma_at_1m)
+        depths = measured.only(near)
         if depths.count < LEAST:
-            measured = "none was measured on it" if ratio is None else f"the measured ones are {ratio:.3g} times those"
+            ratio = measured.ratio_to(points.in_camera(state)[:, 2])
+            found_there = (
+                "none was measured on it" if ratio is None else f"the measured ones are {ratio:.3g} times those"
+            )
             raise RegistrationError(
                 f"only {depths.count} of {len(points)} points on the object have a depth near the one that the "
-                f"landmarks give; {measured}. Is the depth registered to this camera? If not, do that first; else "
+                f"landmarks give; {found_there}. Is the depth registered to this camera? If not, do that first; else "
                 f"correct --depth-per-metre, {DEPTH_SCALE}, or the landmarks"
             )
         found = estimator.estimate(
@@ -233,6 +233,37 @@ def refine_by_depth(
         state = found.state
     assert found is not None
     return found
+
+
+def depth_term(
+    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float = SIGMA_AT_1M
+) -> DepthTerm:
+    """What a depth image says of the object's state in its frame, as a term beside those of other frames.
+
+    Its points count for as many as those of a keyframe do, each with what depth shows there if that is more than noise.
+
+    Parameters
+    ----------
+    state : near to which the object is, as registered with this image.
+    image : (h, w) as recorded, metres, NaN where unknown.
+    """
+    points, places, measured, near = _depths_in_view(estimator, state, image, 1.0, sigma_at_1m)
+    depths = measured.only(near)
+    variance = depths.variance_px(depths.terms(points, state)[3])
+    share = np.sqrt(min(EFFECTIVE_POINTS / max(depths.count, 1), 1.0) / variance)
+    return DepthTerm(estimator.model, estimator.camera.distort_pixels(places), depths, float(share))
+
+
+def _depths_in_view(
+    estimator: Estimator, state: State, image: NDArray[np.float32], squared_px: float, sigma_at_1m: float
+) -> tuple[BoundPoints, Array, PointDepths, NDArray[np.bool_]]:
+    """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near it."""
+    points, places = _surface_in_view(estimator, state)
+    seen = np.ones(len(points), dtype=bool)
+    depths = PointDepths.sampled(image, places, seen, estimator.camera, squared_px, sigma_at_1m)
+    size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
+    near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
+    return points, places, depths, near
 
 
 def _surface_in_view(estimator: Estimator, state: State) -> tuple[BoundPoints, Array]:

@@ -3,7 +3,8 @@
 The pose places the reference view's points on the mesh and is that of every other frame too. In the reference view
 any pose explains these points; in a deformed one only the right pose does. So the pose, what else is one over the
 sequence and, on request, terms of the camera are found as the minimum of the landmarks' residuals and those of
-keyframes, each keyframe at its own best parameters (variable projection; Golub and Pereyra 1973).
+keyframes, each keyframe at its own best parameters (variable projection; Golub and Pereyra 1973). Depths count in the
+keyframes as they do in single frames, by the same noise model.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.optimize import OptimizeResult
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
@@ -108,7 +110,10 @@ class StillProblem:
         self._reference = camera.distort_pixels(reference_pixels)
         self._recorded = [_with_pixels(frame, camera.distort_pixels) for frame in keyframes]
         self._own = [frame.state.parameters for frame in keyframes]
-        self._sigmas = np.ones(len(keyframes))
+        # Of pixels, and of depths in pixels, by which these count against pixels.
+        noise = [1.0 if frame.depths is None else np.sqrt(frame.depths.squared_px) for frame in keyframes]
+        self._floors = np.column_stack([np.full(len(keyframes), LEAST_SIGMA_PX), noise])
+        self._sigmas = np.column_stack([np.ones(len(keyframes)), noise])
 
     @property
     def size(self) -> int:
@@ -176,39 +181,62 @@ class StillProblem:
         self, estimator: Estimator, points: BoundPoints, met: NDArray[np.bool_], state: State
     ) -> Iterator[Array]:
         """The scaled residuals of each keyframe; 0 for points of the reference view that met nothing."""
+        n_met = int(met.sum())
         for number, recorded in enumerate(self._recorded):
-            frame = _with_pixels(recorded, estimator.camera.undistort_pixels)
-            found, left, weights = self._fitted(estimator, frame.measured(points, met), state, self._own[number])
+            frame, (of_pixels, of_depths) = (
+                _with_pixels(recorded, estimator.camera.undistort_pixels),
+                self._sigmas[number],
+            )
+            depths = None if frame.depths is None else frame.depths.take(met)
+            found, left, weights, far = self._fitted(
+                estimator, frame.measured(points, met), depths, state, self._own[number]
+            )
             self._own[number] = found
             huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
-            left *= (
-                np.sqrt(weights * huber * EFFECTIVE_POINTS / max(weights.sum(), 1.0))[:, None] / self._sigmas[number]
-            )
-            scaled, n_met = np.zeros((len(met) + len(left) - int(met.sum()), 2)), int(met.sum())
+            left *= np.sqrt(weights * huber * EFFECTIVE_POINTS / max(weights.sum(), 1.0))[:, None] / of_pixels
+            scaled = np.zeros((len(met) + len(left) - n_met, 2))
             scaled[: len(met)][met], scaled[len(met) :] = left[:n_met], left[n_met:]
             yield scaled.ravel()
+            if depths is not None:
+                scaled = np.zeros(len(met))
+                scaled[met] = depths.bounded(far[:n_met]) * np.sqrt(EFFECTIVE_POINTS / max(depths.count, 1)) / of_depths
+                yield scaled
 
     def weigh(self, residuals: Array) -> None:
         """Take the keyframes' standard deviations from what ``residuals`` left of them."""
         end = len(residuals)
         for number in reversed(range(len(self._recorded))):
             frame = self._recorded[number]
-            size = 2 * (len(frame.pixels) + (0 if frame.outline is None else len(frame.outline.pixels)))
-            rms = np.sqrt(np.sum(residuals[end - size : end] ** 2) / (2.0 * EFFECTIVE_POINTS))
-            self._sigmas[number] = max(self._sigmas[number] * rms, LEAST_SIGMA_PX)
-            end -= size
+            n_points, n_outline = len(frame.pixels), 0 if frame.outline is None else len(frame.outline.pixels)
+            n_depths = 0 if frame.depths is None else n_points
+            begin, middle = end - 2 * (n_points + n_outline) - n_depths, end - n_depths
+            pixels, depths = residuals[begin:middle], residuals[middle:end]
+            rms = np.sqrt([np.sum(pixels**2) / (2.0 * EFFECTIVE_POINTS), np.sum(depths**2) / EFFECTIVE_POINTS])
+            self._sigmas[number] = np.maximum(self._sigmas[number] * rms, self._floors[number])
+            end = begin
 
     def _fitted(
-        self, estimator: Estimator, measured: tuple[BoundPoints, Array, Array, Array], state: State, own: Array
-    ) -> tuple[Array, Array, Array]:
-        """A keyframe's parameters (d,) in the pose of ``state``, what they leave (p, 2), pixels, and weights (p,)."""
+        self,
+        estimator: Estimator,
+        measured: tuple[BoundPoints, Array, Array, Array],
+        depths: PointDepths | None,
+        state: State,
+        own: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        """A keyframe at its best in the pose of ``state``.
+
+        Returns
+        -------
+        Its parameters (d,), what they leave (p, 2), weights (p,), and what they leave of depths (p,), all in pixels.
+        """
         points, pixels, weights, normals = measured
+        depths = None if depths is None else depths.padded(len(points))
         own = own.copy()
         own[self._constant] = state.parameters[self._constant]
         model, free, left = self._model, self._free, np.zeros_like(pixels)
         for step in range(STEPS + 1):
             at = replace(state, parameters=own)
-            _, hessian, gradient, left = estimator.evaluate(points, pixels, weights, at, normals)
+            _, hessian, gradient, left = estimator.evaluate(points, pixels, weights, at, normals, depths=depths)
             if step == STEPS or not len(free):
                 break
             block = hessian[np.ix_(free, free)]
@@ -217,7 +245,8 @@ class StillProblem:
             own[free] += change
             if np.abs(change / (model.upper - model.lower)[free]).max() < 1e-6:
                 break
-        return own, np.nan_to_num(left), weights
+        far = np.zeros(len(points)) if depths is None else depths.terms(points, replace(state, parameters=own))[3]
+        return own, np.nan_to_num(left), weights, far
 
     def fitted(self, unknowns: Array, jacobian: Array) -> StillFit:
         """The result at the minimum, with the residuals' ``jacobian`` (r, n) there."""

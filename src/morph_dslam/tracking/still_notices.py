@@ -99,7 +99,7 @@ def still_notices(found: StillFit, known: LandmarkTerm | StateTerm, given: Camer
     given : the camera as its file has it.
     """
     if isinstance(known, LandmarkTerm):
-        deviations = np.linalg.norm(known.residuals(found.camera, found.state).reshape(-1, 2), axis=1)
+        deviations = np.linalg.norm(known.away(found.camera, found.state), axis=1)
         # Of a coordinate, as the standard deviation is.
         rms = float(np.sqrt(np.mean(deviations**2) / 2.0))
         if rms > MOST_DEVIATIONS:

@@ -15,12 +15,13 @@ from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
-from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.known_state import LandmarkDepthTerm, LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.options import PoseFrom
 from morph_dslam.tracking.placement import PlacedObject
-from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, landmark_deviation
+from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, depth_term, landmark_deviation
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
 from morph_dslam.tracking.still_notices import still_notices
@@ -83,12 +84,16 @@ def with_still_pose(
 
 
 def known_state(part: PlacedObject) -> LandmarkTerm | StateTerm:
-    """What an object's registration rests on: its landmarks, or what these and other measurements gave together."""
+    """What an object's registration rests on: landmarks, depth, or what these and other measurements gave together."""
     landmarks, registration = part.object.start, part.registration
     if not isinstance(landmarks, Landmarks) or registration.facts.get("corrected_by_outline", False):
         return _state_term(part, _covariance_of_first_frame(part))
     sigma = landmark_deviation(registration.facts["sigma_px"])
-    return LandmarkTerm(bind_landmarks(part.model, landmarks.points), landmarks.pixels, sigma)
+    bound = bind_landmarks(part.model, landmarks.points)
+    if part.depth is None:
+        return LandmarkTerm(bound, landmarks.pixels, sigma)
+    depth = depth_term(Estimator(part.model, part.camera), registration.state, part.depth, part.options.depth_sigma)
+    return LandmarkDepthTerm(bound, landmarks.pixels, sigma, depth)
 
 
 def _state_term(part: PlacedObject, covariance: Array) -> StateTerm:

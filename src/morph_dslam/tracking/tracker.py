@@ -510,7 +510,7 @@ class Tracker:
         if not self._view.number:
             weights = inliers.astype(float)
             known = (estimate.state, estimate.sigma_px, hypothesis.outline)
-            self.last_seen = Keyframe(found.pixels, weights, *known, found.recorded)
+            self.last_seen = Keyframe(found.pixels, weights, *known, found.recorded, hypothesis.point_depths)
             if not hypothesis.outline_alone:
                 shape = self.reference.points.field.value(estimate.state.parameters)
                 depth = middle(self.reference.points.in_camera(estimate.state)[:, 2])
