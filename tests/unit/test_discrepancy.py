@@ -9,6 +9,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model.discrepancy import (
     Discrepancy,
     DiscrepancyBasis,
+    DiscrepancyDeviation,
     farthest_points,
     largest_deformation,
     load_discrepancies,
@@ -71,6 +72,39 @@ def test_between_its_centres_the_process_is_the_conditional_mean():
     np.testing.assert_allclose(basis.influence(basis.centres), np.eye(12), atol=1e-9)
 
 
+def test_deviations_inside_are_those_of_kriging():
+    """On a sphere's surface the process is known: inside, the conditional variance; far away, the process's own."""
+    rng, length, amplitude = np.random.default_rng(7), 0.15, 3e-3
+    surface = 0.1 * rng.standard_normal((60, 3))
+    surface *= 0.1 / np.linalg.norm(surface, axis=1, keepdims=True)
+    basis = DiscrepancyBasis(surface, length)
+    exact = DiscrepancyDeviation(np.zeros((180, 180)), amplitude, basis)
+    found = Discrepancy(basis, np.zeros((60, 3)), exact)
+    places = np.vstack([np.outer([0.1, 0.07, 0.04, 0.0], surface[5] / 0.1), [[9.0, 0.0, 0.0]]])
+    apart = np.linalg.norm(surface[:, None] - surface, axis=2)
+    to_places = matern(np.linalg.norm(places[:, None] - surface, axis=2), length)
+    conditional = 1.0 - np.sum(to_places * np.linalg.solve(matern(apart, length), to_places.T).T, axis=1)
+    variances = found.covariances(places)
+    np.testing.assert_allclose(variances, amplitude**2 * conditional[:, None, None] * np.eye(3), atol=1e-3 * 9e-6)
+    deeper = variances[:, 0, 0]
+    assert np.all(np.diff(deeper[:4]) > 0.0)
+    assert deeper[-1] == pytest.approx(amplitude**2, rel=1e-5)
+    joint = found.joint_covariance(places).reshape(5, 3, 5, 3)
+    np.testing.assert_allclose(joint[range(5), :, range(5)], variances, atol=1e-14)
+
+
+def test_where_nothing_was_seen_the_prior_is_back_everywhere():
+    """By the law of total variance: the centres vary as the process does, and so does every other place."""
+    rng, length, amplitude = np.random.default_rng(8), 0.2, 2e-3
+    basis = DiscrepancyBasis(rng.uniform(-0.1, 0.1, (20, 3)), length)
+    apart = matern(np.linalg.norm(basis.centres[:, None] - basis.centres, axis=2), length)
+    prior = DiscrepancyDeviation(amplitude**2 * np.kron(np.eye(3), apart), amplitude, basis)
+    places = rng.uniform(-0.15, 0.15, (6, 3))
+    nothing = Discrepancy(basis, np.zeros((20, 3)), prior)
+    expected = np.kron(matern(np.linalg.norm(places[:, None] - places, axis=2), length), amplitude**2 * np.eye(3))
+    np.testing.assert_allclose(nothing.joint_covariance(places), expected, atol=1e-3 * amplitude**2)
+
+
 def test_centres_are_no_farther_from_any_node_than_from_each_other():
     nodes = np.random.default_rng(1).uniform(0.0, 1.0, (500, 3))
     centres = nodes[farthest_points(nodes, 25)]
@@ -103,6 +137,10 @@ def test_a_shape_that_the_model_does_not_have_is_found_from_one_image(radius, an
     by_model = mean_distance(state, None, truth)
     assert by_model > 4e-3
     assert mean_distance(state, found, truth) < 0.4 * by_model
+    shape = MODEL.positions(state.parameters) + found.displacement(MODEL.nodes)
+    missed = state.camera_from_object.apply(shape) - POSE.apply(truth)
+    stated = np.sqrt(found.covariances(MODEL.nodes).trace(axis1=1, axis2=2))
+    assert 0.2 < np.sqrt(np.mean(np.sum(missed**2, axis=1) / stated**2)) < 2.0
     # From the discrepancy of the frame before one step leads to the same.
     again = fit.fit(measured(points, pixels, weights), state, found)
     np.testing.assert_allclose(again.values, found.values, atol=3e-4)

@@ -12,6 +12,7 @@ from morph_dslam.cli.track import print_summary
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, DiscrepancyDeviation
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.model_errors import ModelDeviation
 from morph_dslam.tracking.estimator import Estimate, State
@@ -108,6 +109,28 @@ def test_deviations_are_finite_differences_times_the_covariance():
     assert found.size_std == pytest.approx(float(np.sqrt(along @ covariance @ along)), rel=1e-6)
 
 
+def test_a_discrepancy_widens_deviations_by_the_process():
+    """A place far from all that was seen: displacements have the process's deviation, and turns that of its slope.
+
+    The turn of a bent plate's corner about z is half the curl; a component of a Matern process (5/2) has slopes of
+    variance 5 / 3 amplitude^2 / length^2, independent of those of other components.
+    """
+    amplitude, length = 2e-3, 0.1
+    far = DiscrepancyBasis(np.array([[50.0, 0.0, 0.0]]), length)
+    deviation = DiscrepancyDeviation(np.zeros((3, 3)), amplitude, far)
+    result = in_frame(MODEL, [0.0, 0.0, 0.0], np.zeros((3, 3)))
+    run = run_of(MODEL, [CORNER], replace(result, discrepancy=Discrepancy(far, np.zeros((1, 3)), deviation)))
+    assert run.results[0].discrepancy.deviation is None, "runs may be long"
+    np.testing.assert_allclose(run.point_displacements()["corner"][0].std, amplitude, rtol=1e-5)
+    slope = np.sqrt(5.0 / 3.0) * amplitude / length
+    assert run.point_turns()["corner"][0].std == pytest.approx([slope, slope, slope / np.sqrt(2.0)], rel=0.15)
+    assert summarise(run)["points"][0]["not_counted"] == []
+    np.testing.assert_allclose(
+        replace(result, discrepancy=Discrepancy(far, np.zeros((1, 3)), deviation)).position_std(),
+        np.sqrt(result.position_std() ** 2 + 3.0 * amplitude**2),
+    )
+
+
 def test_unknown_parameters_leave_a_displacement_open():
     result = in_frame(MODEL, STATE, np.full((3, 3), np.inf))
     (found,) = run_of(MODEL, [CORNER], result).point_displacements()["corner"]
@@ -192,7 +215,8 @@ def test_table_file_summary_and_plot_have_each_point(tmp_path, capsys):
     assert (middle["name"], middle["at_mm"], middle["frame"]) == ("middle", pytest.approx([0.0] * 3, abs=1e-9), 1)
     print_summary(tmp_path, summary)
     said = capsys.readouterr().out
-    assert "largest displacement of 'middle': 40 ± 1 mm in frame 1\n" in said
+    law = ", not counting errors of the model's law, supports and loads\n"
+    assert f"largest displacement of 'middle': 40 ± 1 mm in frame 1{law}" in said
     assert "largest rotation of 'corner': " in said
     plot_points(tmp_path / "points.png", run)
     assert (tmp_path / "points.png").stat().st_size > 1000

@@ -191,8 +191,9 @@ def test_fields_that_the_model_misses_are_named_and_forces_say_what_their_deviat
     assert "misses 34 % of von Mises stress at held-out solutions" in flag["text"]
     print_summary(tmp_path, summary)
     said = capsys.readouterr().out
-    assert "N in frame 0, not counting the model's own error at given parameters, 6 %\n" in said
-    assert "N in frame 0, not counting the model's own reduction error at given parameters, 390 %\n" in said
+    law = ", and errors of the model's law, supports and loads\n"
+    assert f"N in frame 0, not counting the model's own error at given parameters, 6 %{law}" in said
+    assert f"N in frame 0, not counting the model's own reduction error at given parameters, 390 %{law}" in said
     sides = {name: {**entry, "largest_N": 50.0} for name, entry in certificate.items() if name.endswith("_side")}
     swapped = replace(run, model=replace(model, certificate=certificate | sides))
     assert "34 % of von Mises stress and 390 % of forces" in notices_of(swapped)[0].text

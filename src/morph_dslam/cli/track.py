@@ -175,15 +175,15 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
         print(value_line(figures))
     for figures in summary["largest_forces"]:
         line = "largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures)
-        print(line + _model_error(figures))
+        print(line + _not_counted(figures))
     for figures in summary.get("points", []):
         if "frame" in figures:
             line = "largest displacement of '{name}': {displacement_mm:.4g} ± {standard_deviation_mm:.2g} mm in frame "
-            print((line + "{frame}").format(**figures))
+            print((line + "{frame}").format(**figures) + _not_counted(figures))
             line = (
                 "largest rotation of '{name}': {rotation_deg:.4g} ± {rotation_standard_deviation_deg:.2g} degrees in "
             )
-            print((line + "frame {rotation_frame}").format(**figures))
+            print((line + "frame {rotation_frame}").format(**figures) + _not_counted(figures))
     print(f"wrote {folder}")
     line = f"tracked={summary['n_tracked']}/{summary['n_frames']}"
     if "live" in summary:
@@ -197,12 +197,16 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     print(line + "".join(f" {kind}={summary[f'n_{kind}']}" for kind in kinds if summary[f"n_{kind}"]))
 
 
-def _model_error(figures: dict[str, Any]) -> str:
-    """What a force's deviation does not contain, if the model states it: it has what the mesh does to parameters."""
-    if "model_error" not in figures:
-        return ""
-    of = "error" if figures["model_error_of"] == "all" else "reduction error"
-    return f", not counting the model's own {of} at given parameters, {100.0 * figures['model_error']:.3g} %"
+def _not_counted(figures: dict[str, Any]) -> str:
+    """What the deviation of a force or of a point does not contain; it has what the mesh does to parameters."""
+    parts: list[str] = []
+    if "model_error" in figures:
+        of = "error" if figures["model_error_of"] == "all" else "reduction error"
+        parts.append(f"the model's own {of} at given parameters, {100.0 * figures['model_error']:.3g} %")
+    if figures["not_counted"]:
+        *some, last = figures["not_counted"]
+        parts.append(f"errors of the model's {' and '.join([', '.join(some), last] if some else [last])}")
+    return f", not counting {', and '.join(parts)}" if parts else ""
 
 
 def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:

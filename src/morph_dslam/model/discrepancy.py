@@ -3,7 +3,8 @@
 No reduced model holds all that a real object does: its loads, its supports, its material differ. The
 discrepancy between model and object (Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001) is described by the
 displacements at a few points spread over the surface, with a Matern covariance (5/2) of the points' distance
-in the undeformed object. Between them it is the process's conditional mean.
+in the undeformed object. Between them it is the process's conditional mean. Inside, the surface leaves it open: the
+deeper a place, the more of the process's own deviation comes back.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class DiscrepancyBasis:
     @cached_property
     def precision(self) -> Array:
         """Inverse (m, m) of the covariance of a component at the centres, for a process of unit variance."""
-        covariance = self._covariance(self.centres)
+        covariance = self.covariance(self.centres)
         return np.asarray(cho_solve(cho_factor(covariance), np.eye(len(covariance))))
 
     def influence(self, positions: Array) -> Array:
@@ -73,9 +74,10 @@ class DiscrepancyBasis:
 
     def influence_on(self, positions: Array) -> Array:
         """`influence` that nobody keeps."""
-        return self._covariance(positions) @ self.precision
+        return self.covariance(positions) @ self.precision
 
-    def _covariance(self, positions: Array) -> Array:
+    def covariance(self, positions: Array) -> Array:
+        """Of a component at positions (n, 3) and at the centres (n, m), for a process of unit variance."""
         return matern(np.ascontiguousarray(positions), self.centres, self.length)
 
 
@@ -96,20 +98,68 @@ def matern(points, centres, length):
 
 
 @dataclass(frozen=True)
+class DiscrepancyDeviation:
+    """How well a discrepancy is known.
+
+    Attributes
+    ----------
+    covariance : (3 m, 3 m) of the centres' displacements, component by component, square metres.
+    amplitude : standard deviation of the process, metres.
+    surface : points all over the surface: what the process does inside is taken to follow from what it does there.
+    """
+
+    covariance: Array
+    amplitude: float
+    surface: DiscrepancyBasis
+
+    def left(self, positions: Array, others: Array | None = None) -> Array:
+        """Variance (n,) of a component that the whole surface leaves at positions (n, 3), or covariance (n, k)."""
+        influence = self.surface.influence(positions)
+        if others is None:
+            told = np.sum(influence * self.surface.covariance(positions), axis=1)
+            return np.asarray(self.amplitude**2 * np.maximum(1.0 + JITTER - told, 0.0), dtype=np.float64)
+        alike = matern(np.ascontiguousarray(positions), np.ascontiguousarray(others), self.surface.length)
+        return self.amplitude**2 * (alike - influence @ self.surface.covariance(others).T)
+
+
+@dataclass(frozen=True)
 class Discrepancy:
     """The discrepancy in one frame.
 
     Attributes
     ----------
     values : (m, 3) displacements of the basis's centres beyond the model's, in the object's frame, metres.
+    deviation : how well it is known; None where that was not estimated.
     """
 
     basis: DiscrepancyBasis
     values: Array
+    deviation: DiscrepancyDeviation | None = None
 
     def displacement(self, positions: Array) -> Array:
         """The displacement (n, 3) at positions (n, 3) of the undeformed object, both metres."""
         return self.basis.influence(positions) @ self.values
+
+    def covariances(self, positions: Array) -> Array:
+        """Covariance (n, 3, 3) of the displacement at each of positions (n, 3), square metres; zero if not known."""
+        if self.deviation is None:
+            return np.zeros((len(positions), 3, 3))
+        influence, m = self.basis.influence(positions), len(self.values)
+        found = np.empty((len(positions), 3, 3))
+        for a, b in np.ndindex(3, 3):
+            block = self.deviation.covariance[a * m : (a + 1) * m, b * m : (b + 1) * m]
+            found[:, a, b] = np.sum((influence @ block) * influence, axis=1)
+        return found + self.deviation.left(positions)[:, None, None] * np.eye(3)
+
+    def joint_covariance(self, positions: Array) -> Array:
+        """Covariance (3 n, 3 n) of the displacements at few positions (n, 3), point by point; zero if not known."""
+        if self.deviation is None:
+            return np.zeros((3 * len(positions), 3 * len(positions)))
+        influence, m = self.basis.influence(positions), len(self.values)
+        of_centres = self.deviation.covariance.reshape(3, m, 3, m)
+        found = np.einsum("nm,ambk,lk->nalb", influence, of_centres, influence, optimize=True)
+        found += np.einsum("nl,ab->nalb", self.deviation.left(positions, positions), np.eye(3))
+        return found.reshape(3 * len(positions), -1)
 
 
 def farthest_points(nodes: Array, count: int, first: int | None = None) -> NDArray[np.int64]:

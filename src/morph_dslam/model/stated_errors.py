@@ -61,3 +61,8 @@ def largest_force_error(model: ReducedModel, support: str) -> float:
     stated = force_error(model, support)
     largest = model.certificate.get(f"{REACTION}{FORCE}{support}", {}).get("largest_N")
     return stated[0] * largest if stated is not None and largest is not None else 0.0
+
+
+def uncounted(model: ReducedModel) -> list[str]:
+    """What of a model no deviation of a shape or a force contains: it may be wrong and leave the images alike."""
+    return ["law", "supports"] + ([] if model.n_loads else ["loads"])

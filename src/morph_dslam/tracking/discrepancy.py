@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, farthest_points
+from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis, DiscrepancyDeviation, farthest_points
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.noise import Observations
@@ -228,12 +228,14 @@ class DiscrepancyFit:
         nodes = model.nodes[used]
         diagonal = float(np.linalg.norm(np.ptp(nodes, axis=0)))
         self.basis = DiscrepancyBasis.spread_over(nodes, options.centres, options.length * diagonal)
-        precision = self.basis.precision / (options.amplitude * diagonal) ** 2
+        self._amplitude = options.amplitude * diagonal
+        precision = self.basis.precision / self._amplitude**2
         self._precision: Array = np.kron(np.eye(3), precision).astype(np.float64)
         rows = farthest_points(nodes, options.samples)
         corners = first[rows]
         weights = np.eye(3)[corners % 3]
         self._samples = BoundPoints.from_surface(model, SurfacePoints(corners // 3, weights))
+        self._surface = DiscrepancyBasis(np.ascontiguousarray(self._samples.rest), self.basis.length)
         self._lines = _neighbour_lines(self._samples.rest, options.neighbours)
         start, end = self._samples.rest[self._lines.T]
         self._lengths = np.linalg.norm(start - end, axis=1)
@@ -254,8 +256,10 @@ class DiscrepancyFit:
             there = positions + influence @ values @ rotation.T
             derivatives, residuals, weights = self.seen(measured, there)
             data = _Quadratic.of_residuals(derivatives @ rotation, residuals, weights, influence)
-            values = values + (self.prior(shape, rotation, values) + data).minimum()
-        return Discrepancy(self.basis, values)
+            cost = self.prior(shape, rotation, values) + data
+            values = values + cost.minimum()
+        covariance = cho_solve(cho_factor(cost.hessian), np.eye(values.size))
+        return Discrepancy(self.basis, values, DiscrepancyDeviation(covariance, self._amplitude, self._surface))
 
     def _influence_on(self, rest: Array) -> Array:
         """The centres' influence (p, m) on points (p, 3), most of which are where they were in the last call."""

@@ -67,10 +67,15 @@ class Surroundings:
         by_model = estimate.model_displacement**2 / (2.0 * self.gyration**2) * np.eye(3)
         found = []
         for rows in self.rows:
-            turn, by_parameters = turn_of(self.rest[rows], self.rest[rows] + values[rows], slopes[:, rows])
+            rest = self.rest[rows]
+            turn, by_parameters = turn_of(rest, rest + values[rows], slopes[:, rows])
             spread = np.full((3, 3), np.inf)
             if np.isfinite(covariance).all():
                 spread = by_parameters @ covariance @ by_parameters.T + by_model
+            if discrepancy is not None and discrepancy.deviation is not None:
+                each = np.eye(rest.size).reshape(-1, *rest.shape)
+                by_nodes = turn_of(rest, rest + values[rows], each)[1]
+                spread = spread + by_nodes @ discrepancy.joint_covariance(rest) @ by_nodes.T
             found.append(VectorEstimate.of(turn, spread))
         return found
 

@@ -188,7 +188,7 @@ class FrameResult:
 
     def displacement_std(self) -> Array:
         """Standard deviation (n,) of the displacement of every node, metres."""
-        return displacement_std(self.model, self._tracked)
+        return self._with_discrepancy(displacement_std(self.model, self._tracked))
 
     def positions(self) -> Array:
         """Of every node (n, 3) in the camera frame, metres."""
@@ -200,7 +200,14 @@ class FrameResult:
 
         Both are the root of the mean square distance over all directions.
         """
-        return position_std(self.model, self._tracked)
+        return self._with_discrepancy(position_std(self.model, self._tracked))
+
+    def _with_discrepancy(self, deviations: Array) -> Array:
+        """Deviations (n,) of the nodes' places with that of the discrepancy, where it was estimated."""
+        if self.discrepancy is None:
+            return deviations
+        more = self.discrepancy.covariances(self.model.nodes).trace(axis1=1, axis2=2)
+        return np.asarray(np.sqrt(deviations**2 + more), dtype=np.float64)
 
     def von_mises(self, place: str | None = None) -> Array:
         """Von Mises stress (n,) of every node, pascals.

@@ -28,13 +28,13 @@ from morph_dslam.io.writing import writing
 from morph_dslam.model import save_model
 from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
-from morph_dslam.model.stated_errors import force_error
+from morph_dslam.model.stated_errors import force_error, uncounted
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
 from morph_dslam.tracking.repeated_pictures import RepeatedPictures
-from morph_dslam.tracking.result import STAGES
+from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_notices import flags_of, notices_of
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
@@ -76,16 +76,18 @@ class RunFolder:
         make_run_folder(path, overwrite)
         self.path, self.name, self.results, self.overwrite = path, name, results, overwrite
         self._camera, self._inner, self._repeated = camera, inner, RepeatedPictures()
+        self._centres = InnerCentres(inner)
 
     def __call__(self, tracked: TrackedFrame) -> None:
         """Take in a frame."""
         if tracked.frame.captured is not None:
             self._repeated.add(tracked.frame)
         self.results.add(tracked.frame.index, tracked.frame.timestamp, tracked.results[self.name])
+        self._centres.add(tracked.results[self.name])
 
     def start_again(self, results: RunResults, camera: Camera) -> None:
         """Take in the frames of another pass in place of those so far, by the camera as it is known now."""
-        self.results, self._camera = results, camera
+        self.results, self._camera, self._centres = results, camera, InnerCentres(self._inner)
 
     def write(self, facts: dict[str, Any] | None = None, notices: Sequence[Notice] = ()) -> dict[str, Any]:
         """Write tables, summary, plots, model and camera; returns the summary.
@@ -106,7 +108,7 @@ class RunFolder:
     def _write(self, facts: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
         run, path, notices = self.results, self.path, [*notices, *self._repeated.notices()]
         write_hdf5(path / "result.h5", run)
-        write_inner_positions(path / "result.h5", run, self._inner)
+        self._centres.write(path / "result.h5")
         write_csv(path / "frames.csv", run)
         save_trajectory(path / "trajectory.txt", camera_path(run))
         save_model(path / "model.morph", run.model.without_loads)
@@ -309,6 +311,7 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
         if known:
             largest, frame = max(((reaction.force, frame) for reaction, frame in known), key=lambda one: one[0].size)
             figures = {"on": name, "force_N": largest.size, "standard_deviation_N": largest.size_std, "frame": frame}
+            figures["not_counted"] = uncounted(run.model)
             error = force_error(run.model, name)
             if error is not None:
                 figures |= {"model_error": error[0], "model_error_of": "all" if error[1] else "reduction"}
@@ -320,12 +323,15 @@ def largest_of_points(run: RunResults) -> list[dict[str, Any]]:
     """Of each named point its place, and its largest displacement and rotation, millimetres and degrees."""
     found: list[dict[str, Any]] = []
     turns = run.point_turns()
+    # A discrepancy is what the object has beyond the model, whatever that comes from.
+    not_counted = [] if any(result.discrepancy for result in run.results) else uncounted(run.model)
     for k, (name, moved) in enumerate(run.point_displacements().items()):
         assert run.points is not None
         figures: dict[str, Any] = {"name": name, "at_mm": (1e3 * run.points.rest[k]).tolist()}
         figures |= _largest(moved, run, 1e3, ("displacement_mm", "standard_deviation_mm", "frame"))
         names = ("rotation_deg", "rotation_standard_deviation_deg", "rotation_frame")
         figures |= _largest(turns[name], run, float(np.degrees(1.0)), names)
+        figures["not_counted"] = not_counted
         found.append(figures)
     return found
 
@@ -360,7 +366,8 @@ def centre_and_std(
 
     With c = R p(mu) + t and the pose's increment on the left, the derivatives by parameters, rotation vector
     and translation are R dp/dmu, -[R p]x and 1; the covariance is carried through them to first order. What the
-    model's own errors add to displacements is added. The centre is moved by ``discrepancy`` too.
+    model's own errors add to displacements is added. The centre is moved by ``discrepancy`` too, and its deviation
+    inside is added.
     """
     state = estimate.state
     centre, sensitivities = structure.centre_and_sensitivities(state.parameters)
@@ -372,18 +379,36 @@ def centre_and_std(
     if not np.isfinite(estimate.covariance).all():
         return arm + state.camera_from_object.translation, np.full(3, np.inf)
     variance = np.maximum(np.einsum("xi,ij,xj->x", jacobian, estimate.image_covariance, jacobian), 0.0)
-    deviation = np.sqrt(variance + estimate.model_displacement**2 / 3.0)
-    return arm + state.camera_from_object.translation, deviation
+    variance = variance + estimate.model_displacement**2 / 3.0
+    if discrepancy is not None:
+        # No mean varies by more than what it is of, on average.
+        beyond = discrepancy.covariances(structure.rest).mean(axis=0)
+        variance = variance + np.maximum(np.diag(rotation @ beyond @ rotation.T), 0.0)
+    return arm + state.camera_from_object.translation, np.sqrt(variance)
 
 
-def write_inner_positions(path: Path, run: RunResults, structures: Sequence[CarriedStructure]) -> None:
-    """Add ``inner/NAME/centre`` and ``centre_std`` (f, 3), metres, NaN where lost, to ``result.h5``."""
-    lost = (np.full(3, np.nan), np.full(3, np.nan))
-    with written_hdf5(path, append=True) as file:
-        for structure in structures:
-            rows = [
-                lost if result.estimate is None else centre_and_std(structure, result.estimate, result.discrepancy)
-                for result in run.results
-            ]
-            group = file.create_group(f"inner/{structure.name}")
-            group["centre"], group["centre_std"] = (np.array(column) for column in zip(*rows, strict=True))
+class InnerCentres:
+    """Where the centres of structures inside are, frame by frame.
+
+    Parameters
+    ----------
+    structures : in the object.
+    """
+
+    def __init__(self, structures: Sequence[CarriedStructure]) -> None:
+        self._structures = structures
+        self._rows: list[list[tuple[Array, Array]]] = []
+
+    def add(self, result: FrameResult) -> None:
+        """Take in a frame."""
+        found, lost = result.estimate, (np.full(3, np.nan), np.full(3, np.nan))
+        self._rows.append(
+            [lost if found is None else centre_and_std(one, found, result.discrepancy) for one in self._structures]
+        )
+
+    def write(self, path: Path) -> None:
+        """Add ``inner/NAME/centre`` and ``centre_std`` (f, 3), metres, NaN where lost, to ``result.h5``."""
+        with written_hdf5(path, append=True) as file:
+            for k, structure in enumerate(self._structures):
+                group = file.create_group(f"inner/{structure.name}")
+                group["centre"], group["centre_std"] = np.array([row[k] for row in self._rows]).swapaxes(0, 1)

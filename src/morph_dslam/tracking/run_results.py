@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.model.discrepancy import largest_deformation
+from morph_dslam.model.discrepancy import Discrepancy, largest_deformation
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.named_points import NamedPoints
@@ -38,7 +38,7 @@ class RunResults:
     points : places of the object that are followed by name; None where there are none.
     frames : (f,) numbers.
     timestamps : (f,) seconds.
-    results : (f,), without the residuals of single points: runs may be long.
+    results : (f,), without the residuals of single points and the deviations of discrepancies: runs may be long.
     """
 
     model: ReducedModel
@@ -54,6 +54,7 @@ class RunResults:
     _largest: list[tuple[float, float]] = field(default_factory=list, repr=False)
     _stressed: list[tuple[float, float]] = field(default_factory=list, repr=False)
     _reactions: list[dict[str, Reaction]] = field(default_factory=list, repr=False)
+    _points: list[tuple[list[VectorEstimate], list[VectorEstimate]] | None] = field(default_factory=list, repr=False)
 
     def add(self, frame: int, timestamp: float, result: FrameResult) -> None:
         if result.estimate is not None:
@@ -61,6 +62,9 @@ class RunResults:
         self.frames.append(frame)
         self.timestamps.append(timestamp)
         self.results.append(result)
+        if result.discrepancy is not None and result.discrepancy.deviation is not None:
+            self._known_points()
+            self.results[-1] = replace(result, discrepancy=replace(result.discrepancy, deviation=None))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -133,35 +137,36 @@ class RunResults:
 
     def point_displacements(self) -> dict[str, list[VectorEstimate | None]]:
         """Of each named point its displacement in every frame, object frame, metres, None where hidden or lost."""
-        if self.points is None:
-            return {}
-        rows = [self._displacements_of_points(result) for result in self.results]
-        return {name: [None if row is None else row[k] for row in rows] for k, name in enumerate(self.points.names)}
-
-    def _displacements_of_points(self, result: FrameResult) -> list[VectorEstimate] | None:
-        assert self.points is not None
-        if result.estimate is None:
-            return None
-        values, slopes = self._field_of_points.value_and_sensitivities(result.estimate.state.parameters)
-        if result.discrepancy is not None:
-            values = values + result.discrepancy.displacement(self.points.rest)
-        d = len(slopes)
-        covariance = result.estimate.image_covariance[:d, :d]
-        if not np.isfinite(covariance).all():
-            return [VectorEstimate.of(value, np.full((3, 3), np.inf)) for value in values]
-        of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
-        of_points += result.estimate.model_displacement**2 / 3.0 * np.eye(3)
-        return [VectorEstimate.of(value, of_point) for value, of_point in zip(values, of_points, strict=True)]
+        return self._of_points(0)
 
     def point_turns(self) -> dict[str, list[VectorEstimate | None]]:
         """Of each named point the rotation vector of its surroundings in every frame, object frame, radians.
 
         None where hidden or lost.
         """
+        return self._of_points(1)
+
+    def _of_points(self, part: int) -> dict[str, list[VectorEstimate | None]]:
         if self.points is None:
             return {}
-        found = [None if r.estimate is None else self._around.turns(r.estimate, r.discrepancy) for r in self.results]
-        return {name: [None if row is None else row[k] for row in found] for k, name in enumerate(self.points.names)}
+        rows = self._known_points()
+        names = enumerate(self.points.names)
+        return {name: [None if row is None else row[part][k] for row in rows] for k, name in names}
+
+    def _displacements_of_points(self, estimate: Estimate, discrepancy: Discrepancy | None) -> list[VectorEstimate]:
+        assert self.points is not None
+        values, slopes = self._field_of_points.value_and_sensitivities(estimate.state.parameters)
+        if discrepancy is not None:
+            values = values + discrepancy.displacement(self.points.rest)
+        d = len(slopes)
+        covariance = estimate.image_covariance[:d, :d]
+        if not np.isfinite(covariance).all():
+            return [VectorEstimate.of(value, np.full((3, 3), np.inf)) for value in values]
+        of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
+        of_points += estimate.model_displacement**2 / 3.0 * np.eye(3)
+        if discrepancy is not None:
+            of_points += discrepancy.covariances(self.points.rest)
+        return [VectorEstimate.of(value, of_point) for value, of_point in zip(values, of_points, strict=True)]
 
     @cached_property
     def _around(self) -> Surroundings:
@@ -196,6 +201,17 @@ class RunResults:
             found = result.estimate
             self._reactions.append({} if found is None else reactions(found, self.modulus_std))
         return self._reactions
+
+    def _known_points(self) -> list[tuple[list[VectorEstimate], list[VectorEstimate]] | None]:
+        """Displacements and turns of the named points."""
+        for result in self.results[len(self._points) :] if self.points is not None else ():
+            found, beyond = result.estimate, result.discrepancy
+            self._points.append(
+                None
+                if found is None
+                else (self._displacements_of_points(found, beyond), self._around.turns(found, beyond))
+            )
+        return self._points
 
     @cached_property
     def _reactions_of_model(self) -> Reactions:
