@@ -257,7 +257,7 @@ def depth_term(
 def _depths_in_view(
     estimator: Estimator, state: State, image: NDArray[np.float32], squared_px: float, sigma_at_1m: float
 ) -> tuple[BoundPoints, Array, PointDepths, NDArray[np.bool_]]:
-    """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near it."""
+    """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near."""
     points, places = _surface_in_view(estimator, state)
     seen = np.ones(len(points), dtype=bool)
     depths = PointDepths.sampled(image, places, seen, estimator.camera, squared_px, sigma_at_1m)
