@@ -155,12 +155,12 @@ BENCHMARKS = {
     "cross_model": Benchmark(
         "Tracking",
         "The boot seal, filmed from a foreign model",
-        "python benchmarks/cross_model.py",
+        "python benchmarks/cross_model.py --seeds 3",
         "simulated with another model: second-order cells on a finer mesh, Yeoh rubber 10 % stiffer, a lever whose "
         "axis is 1 mm and 1 degree off; scanned, registered and tracked with the plain model",
         f"{NOISE}; `disturbed`: also a rolling shutter, a lens and a focal length that are stated wrong, JPEG, "
         "changing exposure, and no readout time stated, with the camera that `morph slam` refines",
-        3,
+        7,
         "`best_mm` is what is left where lever and side of the plain model are fitted to the true displacements; the "
         "limits are 1.2 times that, and 0.4 mm with all disturbances, 0.15 mm without. `von_mises_percent` is the "
         "relative L2 error over the volume, `best_von_mises_percent` that of the best fit. `pose_mm` and "
@@ -168,7 +168,8 @@ BENCHMARKS = {
         "`best_mm` and the stress of the best fit are errors of the plain model (mesh, law, axis); they are not "
         "estimated, and no stated deviation contains them. That a refined camera keeps a principal point which is not "
         "refuted was decided with seed 61 in sight, the size of the patches by which points are "
-        "measured again with seeds 61 to 63.",
+        "measured again with seeds 61 to 63. The refined camera of a scene depends on rounding: seed 61 "
+        "disturbed has had 0.31 to 0.54 mm with the same code.",
     ),
     "paper_sheet_track": Benchmark(
         "Tracking",
