@@ -84,6 +84,28 @@ def test_friction_is_no_wrong_frame_number(late):
     assert list(notices(force + late * 0.25 * FRICTION, arches=arches)) == ["neighbours_alike"]
 
 
+@pytest.mark.parametrize("scale", [10.0, 100.0])
+def test_a_smaller_unit_of_the_places_of_a_curve_is_named(scale):
+    """Millimetres whose title says centimetres, or centimetres of one that says metres."""
+    known = np.linspace(0.0, 0.055, 1101)
+    (notice,) = evaluate_force(pulled_run(ARCHES), ForceCurve("arch", scale * known, 1.25 * pull(known)))["notices"]
+    assert notice["kind"] == "other_place_unit"
+    assert (notice["parameter"], notice["scale"]) == ("arch", pytest.approx(1.0 / scale))
+    assert notice["factor"] == pytest.approx(1.25, rel=1e-3)
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.15, 0.4, 1.0, 4.0, 10.0])
+@pytest.mark.parametrize("reach", [1.0, 10.0])
+def test_right_places_of_a_curve_are_not_accused(factor, reach):
+    """Of a body that is softer or stiffer than the model, of its law, of another one, and with noise."""
+    known = np.linspace(0.0, 0.055 * reach, 110)
+    noise = np.random.default_rng(4).normal(size=len(known))
+    for measured in (pull(known), pull(known) + 2.0 * noise, np.sqrt(known), known, known**2):
+        curve = ForceCurve("arch", known, factor * measured * np.ptp(pull(ARCHES)) / np.ptp(measured[known < 0.05]))
+        found = evaluate_force(pulled_run(ARCHES), curve)["notices"]
+        assert "other_place_unit" not in [notice["kind"] for notice in found]
+
+
 @pytest.mark.parametrize("lag", [0.4, 0.7, 1.5])
 def test_a_lag_of_the_body_is_no_wrong_frame_number(lag):
     measured = pull(0.03 + 0.02 * np.sin(2.0 * np.pi * (CYCLES + lag) / 16.0))

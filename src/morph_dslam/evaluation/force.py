@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.force_curves import LEAST, ForceCurve
-from morph_dslam.evaluation.force_notices import ForceNotice, force_notices
+from morph_dslam.evaluation.force_notices import ForceNotice, OtherFrameNumbers, OtherPlaceUnit, force_notices
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.model import ReducedModel, SeparatedField
@@ -210,8 +210,7 @@ def _notices(
     run: Run, rows: NDArray[np.integer], compared: ReactionInDirection, error: ForceError
 ) -> tuple[ForceNotice, ...]:
     """What a reader must know of forces compared in rows of the run."""
-    every, count = np.flatnonzero(run.tracked), len(run.model.parameters)
-    along = compared.sign * _values(compared.field, run.parameters[every])[:, compared.axis]
+    count = len(run.model.parameters)
     stated = stated_force_error(run.model, compared.support)
     own = (
         0.0
@@ -229,10 +228,21 @@ def _notices(
         error.factor * error.modelled + error.offset,
         np.column_stack([error.modelled, np.ones(len(rows))]),
         own_rms=abs(error.factor) * own,
-        by_frame=(run.frames[every].astype(float), along) if error.curve.against == "frame" else None,
+        explained=_explained(run, compared, error),
         picture="force_evaluation.png",
     )
     return tuple(notices)
+
+
+def _explained(run: Run, compared: ReactionInDirection, error: ForceError) -> ForceNotice | None:
+    """Other frame numbers, or another unit of a curve's places, if they explain what is left."""
+    every = np.flatnonzero(run.tracked)
+    along = compared.sign * _values(compared.field, run.parameters[every])[:, compared.axis]
+    for k, parameter in enumerate(run.model.parameters):
+        if parameter.name == error.curve.against:
+            return OtherPlaceUnit.of(parameter.quantity, error.curve, run.parameters[every, k], along)
+    frames = run.frames[every].astype(float)
+    return OtherFrameNumbers.of(error.curve.name, frames, along, error.places, error.measured)
 
 
 def _axis(model: ReducedModel, against: str) -> tuple[float, str]:

@@ -8,9 +8,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.evaluation.force_curves import FORCE_UNITS, newtons_of
+from morph_dslam.evaluation.force_curves import FORCE_UNITS, ForceCurve, newtons_of
 from morph_dslam.evaluation.frame_numbers import HOW_FRAMES_COUNT, force_shift, in_words
 from morph_dslam.evaluation.likeness import Likeness, likeness, root_mean_square
+from morph_dslam.evaluation.place_units import place_scale
 from morph_dslam.notices import Notice
 
 Array = NDArray[np.float64]
@@ -97,6 +98,43 @@ class OtherFrameNumbers(ForceNotice):
     def text(self) -> str:
         return self.template.format(**{**vars(self), "shift": in_words(self.shift), "how": HOW_FRAMES_COUNT})
 
+    @classmethod
+    def of(cls, name: str, frames: Array, modelled: Array, places: Array, measured: Array) -> OtherFrameNumbers | None:
+        """The notice that forces need, if they do; see `force_shift`."""
+        found = force_shift(frames, modelled, places, measured)
+        return None if found is None else cls(name, found.shift, found.factor, found.rms, found.rms_as_given)
+
+
+@dataclass(frozen=True)
+class OtherPlaceUnit(ForceNotice):
+    """A smaller unit of the parameter that a curve is given by explains what is left.
+
+    Attributes
+    ----------
+    parameter : its name.
+    scale : what its values have to be multiplied by.
+    factor : of the model's forces then.
+    rms, rms_as_given : of what the factor and an offset leave then, and as it is given, newtons.
+    """
+
+    template: ClassVar[str] = (
+        "with {scale:.4g} times the values of {parameter}, {name} is {factor:.4g} times the model's force and an "
+        "offset but for {rms:.3g} N rms, not {rms_as_given:.3g}: is the unit in the title of the first column right?"
+    )
+    parameter: str
+    scale: float
+    factor: float
+    rms: float
+    rms_as_given: float
+
+    @classmethod
+    def of(cls, quantity: str, curve: ForceCurve, places: Array, modelled: Array) -> OtherPlaceUnit | None:
+        """The notice that a curve needs, if it does; see `place_scale`."""
+        found = place_scale(quantity, curve, places, modelled, ALIKE)
+        if found is None:
+            return None
+        return cls(curve.name, curve.against, found.scale, found.factor, found.rms, found.rms_as_given)
+
 
 @dataclass(frozen=True)
 class NeighboursAlike(ForceNotice):
@@ -124,7 +162,7 @@ def force_notices(
     fitted: Array,
     slopes: Array,
     own_rms: float,
-    by_frame: tuple[Array, Array] | None,
+    explained: ForceNotice | None,
     picture: str,
 ) -> tuple[Likeness | None, list[ForceNotice]]:
     """How alike neighbouring residuals are, and what must be known of the forces.
@@ -139,7 +177,7 @@ def force_notices(
     slopes : (n, f) derivatives of these by what was fitted.
     own_rms : of what the model's own errors, and those of the estimates, do to its forces: smaller residuals tell
         nothing.
-    by_frame : of forces by frame, frames (e,) of the run and the model's forces (e,) there.
+    explained : what explains residuals if they are no smaller.
     picture : that shows the residuals.
     """
     order = np.argsort(places, kind="stable")
@@ -149,9 +187,9 @@ def force_notices(
     least = max(own_rms, LEAST_MISSED * root_mean_square(measured - measured.mean()))
     if root_mean_square(fitted - measured) <= least:
         return alike, found
-    shift = None if by_frame is None else force_shift(*by_frame, places, measured)
-    if shift is not None:
-        return alike, [*found, OtherFrameNumbers(name, shift.shift, shift.factor, shift.rms, shift.rms_as_given)]
+    if explained is not None:
+        # With places in the unit that is meant the factor needs no other one.
+        return alike, [explained] if isinstance(explained, OtherPlaceUnit) else [*found, explained]
     if alike is not None and alike.probability < LEAST_PROBABILITY and alike.rms > least:
         found.append(NeighboursAlike(name, alike.durbin_watson, picture))
     return alike, found

@@ -125,18 +125,18 @@ def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) 
     if len(rows) < FEWEST_FORCES:
         return None
     at = {step: np.array([of[place + step] for place in places[rows].tolist()]) for step in reach}
-    fits = {shift: _fit(measured[rows], at[shift]) for shift in (0, *SHIFTS)}
+    fits = {shift: fit_columns(measured[rows], at[shift]) for shift in (0, *SHIFTS)}
     best = min(fits, key=lambda shift: fits[shift][1])
     (factor, *_), rms = fits[best]
     if best == 0 or not fits[0][1] > CLEARLY * rms:
         return None
-    (scale, late, _), _ = _fit(measured[rows], at[best], (at[best + 1] - at[best - 1]) / 2.0)
+    (scale, late, _), _ = fit_columns(measured[rows], at[best], (at[best + 1] - at[best - 1]) / 2.0)
     if not abs(late) <= WHOLE * abs(scale):
         return None
     return ForceShift(best, float(factor), rms, fits[0][1])
 
 
-def _fit(measured: Array, *columns: Array) -> tuple[Array, float]:
+def fit_columns(measured: Array, *columns: Array) -> tuple[Array, float]:
     """Least squares of columns (n,) and a constant: their factors, and the rms of what is left."""
     design = np.column_stack([*columns, np.ones(len(measured))])
     factors = np.asarray(np.linalg.lstsq(design, measured, rcond=None)[0], dtype=np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.evaluation.force_notices import ForceNotice, OtherSize, force_notices
+from morph_dslam.evaluation.force_notices import ForceNotice, OtherFrameNumbers, OtherSize, force_notices
 from morph_dslam.evaluation.likeness import Likeness
 from morph_dslam.identification.measurements import MeasuredForces
 
@@ -65,7 +65,9 @@ def notices(
         predicted,
         np.hstack([slopes, scaled, np.ones((len(slopes), int(forces.free_zero)))]),
         own_rms=float(np.hypot(model_rms, _rms_by_run(forces))),
-        by_frame=(forces.places, predicted) if forces.curve.against == "frame" else None,
+        explained=OtherFrameNumbers.of(forces.name, forces.places, predicted, forces.places, forces.values)
+        if forces.curve.against == "frame"
+        else None,
         picture="identification.png",
     )
 

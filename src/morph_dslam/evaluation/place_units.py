@@ -1,0 +1,60 @@
+"""Force curves over a parameter whose values are in another unit than their title says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.evaluation.force_curves import ForceCurve
+from morph_dslam.evaluation.frame_numbers import CLEARLY, FEWEST_FORCES, fit_columns
+from morph_dslam.units import FACTORS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlaceScale:
+    """Places of a curve that are off by a ratio of units.
+
+    Attributes
+    ----------
+    scale : what they have to be multiplied by.
+    factor : of the model's forces, with right places.
+    rms, rms_as_given : of what the factor and an offset leave with right places, and with those given.
+    """
+
+    scale: float
+    factor: float
+    rms: float
+    rms_as_given: float
+
+
+def place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array, alike: float) -> PlaceScale | None:
+    """Whether a smaller unit of a curve's places explains a factor of its forces, and what that leaves.
+
+    With it more of the curve is compared, which no noise and no other law makes straighter. A larger one is not tried:
+    any short piece of a curve is straight. Most frames are then off the curve as it is given.
+
+    Parameters
+    ----------
+    quantity : of the parameter that the curve is given by.
+    places : (e,) the parameter in frames of the run.
+    modelled : (e,) the model's force there.
+    alike : a factor up to this, or its inverse, needs no explanation.
+    """
+    order = np.argsort(curve.places, kind="stable")
+    known, forces = curve.places[order], curve.forces[order]
+    units = FACTORS[quantity].values()
+    found = []
+    for scale in sorted({a / b for a in units for b in units if a < b}):
+        inside = (places >= scale * known[0]) & (places <= scale * known[-1])
+        if inside.sum() < FEWEST_FORCES:
+            continue
+        (given, _), before = fit_columns(np.interp(places[inside], known, forces), modelled[inside])
+        (factor, _), rms = fit_columns(np.interp(places[inside], scale * known, forces), modelled[inside])
+        is_size = 1.0 / alike <= factor <= alike and not 1.0 / alike <= given <= alike
+        if is_size and before > CLEARLY * rms:
+            found.append(PlaceScale(scale, float(factor), rms, before))
+    return min(found, key=lambda each: each.rms, default=None)
