@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from morph_dslam.studies import discretisation
 from morph_dslam.studies.build import certified_model
 from morph_dslam.studies.defaults import resolve_defaults
 from morph_dslam.studies.discretisation import discretisation_errors
+from morph_dslam.studies.higher_order import HigherOrder, OutOfTime
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
 from morph_dslam.studies.study import Study
@@ -121,8 +123,48 @@ def test_what_exceeds_its_share_is_not_estimated(
     for name, value in changes.items():
         monkeypatch.setattr(discretisation, name, value)
     entry = discretisation_errors(*solved, 0.0)
-    assert list(entry) == ["not_estimated"]
+    assert list(entry) == ["not_estimated", "estimable"]
+    assert entry["estimable"]
     assert why in entry["not_estimated"]
+
+
+def asking_for(study: Study, count: int) -> Study:
+    """The same study with so many states to solve again."""
+    return study.model_copy(update={"sampling": study.sampling.model_copy(update={"refined": count})})
+
+
+def test_an_estimate_that_is_asked_for_takes_what_time_it_needs(
+    solved: tuple[Study, Snapshots, md.ReducedModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(discretisation, "FLOOR", 0.0)
+    study, snapshots, model = solved
+    entry = discretisation_errors(asking_for(study, 2), snapshots, model, 0.0)
+    assert len(entry["coordinates"]) == 2
+    assert "left_out" not in entry
+
+
+@pytest.mark.parametrize("waits", ["for other programs", "for its own share to end"])
+def test_waiting_takes_no_time_and_a_state_that_does_not_converge_leaves_the_others_theirs(
+    solved: tuple[Study, Snapshots, md.ReducedModel], monkeypatch: pytest.MonkeyPatch, waits: str
+) -> None:
+    """The first state waits for longer than all may take together, or uses its share up."""
+    solve, calls = HigherOrder.solve, list[int]()
+
+    def slowly(self: HigherOrder, dofs: Any, mu: Any, in_time: Any) -> Any:
+        calls.append(len(calls))
+        if len(calls) == 1 and waits == "for other programs":
+            time.sleep(1.2)
+        elif len(calls) == 1:
+            while in_time():
+                pass
+            raise OutOfTime
+        return solve(self, dofs, mu, in_time)
+
+    monkeypatch.setattr(discretisation, "FLOOR", 1.2)
+    monkeypatch.setattr(HigherOrder, "solve", slowly)
+    entry = discretisation_errors(*solved, 0.0)
+    assert len(entry["coordinates"]) == 3 - (waits != "for other programs")
+    assert ("1 of 3 states would take more" in entry.get("left_out", "")) == (waits != "for other programs")
 
 
 def test_a_short_build_is_estimated_by_what_the_finer_elements_say_when_solved_to_the_end(
@@ -144,8 +186,7 @@ def test_a_short_build_is_estimated_by_what_the_finer_elements_say_when_solved_t
 
 def test_no_estimate_is_the_first_thing_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study = bar()
-    study = study.model_copy(update={"sampling": study.sampling.model_copy(update={"refined": 0})})
-    model = md.build(study, tmp_path / "bar.morph")
+    model = md.build(asking_for(study, 0), tmp_path / "bar.morph")
     assert next(iter(summarise_model(model))) == "errors"
     assert error_facts(model)["discretisation error"] == "not estimated: switched off by sampling.refined = 0"
     assert cli.main(["info", str(tmp_path / "bar.morph")]) == 0
@@ -202,12 +243,47 @@ def test_finer_elements_find_the_same_homogeneous_state() -> None:
     study = md.make_study(content)
     assert isinstance(study, SolidStudy)
     coarse, finer = study.problem(), study.problem(SolidOptions(order=3, serendipity=True))
-    again = discretisation.HigherOrder(coarse, finer)
+    again = HigherOrder(coarse, finer)
     strokes = np.linspace(0.005, 0.05, 10)[:, None]
     for state in advance(coarse, loaded_state(coarse, np.zeros(1)), strokes)[1:]:
         found = again.solve(state.dofs, state.mu)
         difference = finer.nodal_displacement(found.dofs) - coarse.nodal_displacement(state.dofs)
         assert np.abs(difference).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("cells", "width", "divisions"), [("hex20", "20 mm", [6, 7, 1]), ("tet10", "40 mm", [4, 8, 1])]
+)
+def test_finer_elements_start_from_the_pressures_of_rubber(cells: str, width: str, divisions: list[int]) -> None:
+    """Planar tension to 1.8 times the length: the solution is that of the path from the unloaded strip, soon found."""
+    content = {
+        "name": "planar tension",
+        "mesh": {"generator": "block", "size": ["12 mm", width, "1 mm"], "divisions": divisions, "cells": cells},
+        "materials": {
+            "rubber": {"law": "yeoh", "c10": "0.2 MPa", "c20": "-0.0096 MPa", "c30": "0.00064 MPa", "bulk": "40 MPa"}
+        },
+        "supports": [
+            {"kind": "fixed", "on": "x_max"},
+            {"kind": "displacement", "on": "x_min", "x": "-1 * stroke", "y": "0 mm", "z": "0 mm"},
+        ],
+        "parameters": {"stroke": {"range": ["0 mm", "10 mm"]}},
+    }
+    study, mu, tangents = md.make_study(content), np.array([9.5e-3]), list[int]()
+    assert isinstance(study, SolidStudy)
+    coarse, finer = study.problem(), study.problem(SolidOptions(order=3, serendipity=True))
+    given = advance(coarse, loaded_state(coarse, np.zeros(1)), mu)[-1].dofs
+
+    def in_time() -> bool:
+        tangents.append(1)
+        return True
+
+    found = HigherOrder(coarse, finer).solve(given, mu, in_time).dofs
+    assert len(tangents) <= 10
+    own, again, truth = (
+        problem.nodal_displacement(dofs)
+        for problem, dofs in ((coarse, given), (finer, found), (finer, loaded_state(finer, mu).dofs))
+    )
+    assert np.abs(again - truth).max() < 0.05 * np.abs(own - truth).max()
 
 
 def test_a_finer_solution_on_another_branch_is_left_out(
@@ -217,7 +293,7 @@ def test_a_finer_solution_on_another_branch_is_left_out(
     load = discretisation.load_state
     monkeypatch.setattr(discretisation, "load_state", lambda file: load(file) | {"pivots": np.array(1)})
     entry = discretisation_errors(*solved, 0.0)
-    assert list(entry) == ["not_estimated"]
+    assert list(entry) == ["not_estimated", "estimable"]
     assert "another stability" in entry["not_estimated"]
 
 

@@ -10,6 +10,7 @@ from morph_dslam.errors import MorphError, ParameterError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SeparatedField, SurfacePoints
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.stated_errors import unknown_mesh_error
 from morph_dslam.tracking.binding import facing, view_of
 from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, State
@@ -197,6 +198,25 @@ def test_fields_that_the_model_misses_are_named_and_forces_say_what_their_deviat
     sides = {name: {**entry, "largest_N": 50.0} for name, entry in certificate.items() if name.endswith("_side")}
     swapped = replace(run, model=replace(model, certificate=certificate | sides))
     assert "34 % of von Mises stress and 390 % of forces" in notices_of(swapped)[0].text
+
+
+@pytest.mark.parametrize(
+    ("stated", "is_told"),
+    [
+        ({"not_estimated": "it takes long", "estimable": True}, True),
+        ({"not_estimated": "the solutions are another program's", "estimable": False}, False),
+        ({"errors": {}}, False),
+    ],
+)
+def test_a_mesh_whose_error_was_not_estimated_is_named_once(stated, is_told):
+    model = replace(MODEL, certificate={"discretisation": stated})
+    run = RunResults(model, reference_frame=0)
+    for number in range(3):
+        run.add(number, 0.1 * number, frame_result([0.0, 0.0, 0.0], [1e-3, 0.01, 0.01], [False] * 3))
+    notices = notices_of(run)
+    assert [notice.warning for notice in notices] == [RunWarning.MESH_ERROR_UNKNOWN] * is_told
+    assert all("was not estimated (it takes long)" in notice.text for notice in notices)
+    assert unknown_mesh_error(replace(model, parameters=())) is None
 
 
 def test_a_bound_where_the_undeformed_object_rests_is_no_warning():

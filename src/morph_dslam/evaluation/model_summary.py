@@ -12,6 +12,7 @@ from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.parameter_errors import ENTRY, ERRORS
+from morph_dslam.model.stated_errors import NOT_ESTIMATED
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, TensorTrainFunctions, TuckerFunctions
 
 #: Endings of certificate keys and the unit they stand for.
@@ -83,7 +84,7 @@ def summarise_model(model: ReducedModel) -> dict[str, Table]:
 
 
 #: What a certificate of an earlier version says of the discretisation.
-_UNKNOWN_DISCRETISATION = {"not_estimated": "the model file is of an earlier version"}
+_UNKNOWN_DISCRETISATION = {NOT_ESTIMATED: "the model file is of an earlier version"}
 
 
 def error_facts(model: ReducedModel) -> Facts:
@@ -96,8 +97,8 @@ def error_facts(model: ReducedModel) -> Facts:
     if "n_held_out" in certificate["displacement"]:
         facts["reduction error"] += f", at {_held_out(certificate['displacement']['n_held_out'], 'solve')}"
     discretisation = certificate.get("discretisation", _UNKNOWN_DISCRETISATION)
-    if "not_estimated" in discretisation:
-        unknown = f"not estimated: {discretisation['not_estimated']}"
+    if NOT_ESTIMATED in discretisation:
+        unknown = f"not estimated: {discretisation[NOT_ESTIMATED]}"
         return {"total error": "not estimated", "discretisation error": unknown} | facts
     errors, states = main_errors(discretisation["errors"]), discretisation["coordinates"]
     coarse, finer = discretisation["unknowns"]

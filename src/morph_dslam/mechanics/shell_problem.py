@@ -91,6 +91,7 @@ class ShellProblem(SolidProblem):
         self.material, self.thickness = material, thickness
         self.supports, self.loads = tuple(supports), tuple(loads)
         self.history = self.enhanced = self.contact = None
+        self.regions = []  # a shell's forces and moments stand in their place
         self.in_contact, self.applied_first = 0.0, None
         self.symbols = parameters or ParameterSymbols()
         self.symbols.set(self.symbols.default)

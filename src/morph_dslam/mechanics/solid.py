@@ -179,6 +179,25 @@ class SolidProblem:
             spaces += region.pressures.spaces if region.pressures else []
         return spaces[0] if len(spaces) == 1 else ngs.ProductSpace(*spaces)
 
+    def embedded_pressures(self, coarse: SolidProblem, dofs: Array) -> Array:
+        """Dofs (n_unknowns,) with the pressures of ``dofs`` (n,) of the same solid with elements of lower order.
+
+        All else is zero, and so are pressures of materials that have none in the lower order.
+        """
+        result, own, other = (
+            np.zeros(self.n_unknowns),
+            3 * self.displacements.n_scalar,
+            3 * coarse.displacements.n_scalar,
+        )
+        for region, known in zip(self.regions, coarse.regions, strict=True):
+            n_own = region.pressures.n_dofs if region.pressures else 0
+            n_other = known.pressures.n_dofs if known.pressures else 0
+            if region.pressures and known.pressures:
+                values = dofs[other : other + n_other]
+                result[own : own + n_own] = region.pressures.embedded(known.pressures, values)
+            own, other = own + n_own, other + n_other
+        return result
+
     def split(self, functions: Any) -> tuple[Any, list[list[Any]]]:
         """Displacement, and for each material region its pressure unknowns, of the product space's parts."""
         if not any(region.pressures for region in self.regions):

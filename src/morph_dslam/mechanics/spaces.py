@@ -335,6 +335,18 @@ class PressureSpace:
             if count == 10:
                 self._offsets += [offset[i] * offset[j] for i in range(3) for j in range(i, 3)]
 
+    @property
+    def n_dofs(self) -> int:
+        """Unknowns of all `spaces`."""
+        return sum(space.ndof for space in self.spaces)
+
+    def embedded(self, coarse: PressureSpace, dofs: Array) -> Array:
+        """The same pressure (n_dofs,) as ``dofs`` of a space of lower order on the same region of the same mesh."""
+        result = np.zeros(self.n_dofs)
+        # Functions of lower order come first: in `combine`, and in each of NGSolve's continuous spaces.
+        result[: coarse.n_dofs] = dofs
+        return result
+
     def combine(self, unknowns: list[Any]) -> Any:
         """Pressure of functions of `spaces`, in their unit."""
         result = unknowns[0]

@@ -14,6 +14,8 @@ from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION, ReducedMode
 
 #: Stress and forces that the reduction misses by more than this part are not to be relied on.
 MOST = 0.1
+#: The certificate's entries, within that of the discretisation, of why it has no error, and whether it can have one.
+NOT_ESTIMATED, ESTIMABLE = "not_estimated", "estimable"
 
 
 def doubtful_errors(model: ReducedModel) -> dict[str, float]:
@@ -44,6 +46,15 @@ def _largest(entries: list[tuple[dict[str, Any], str, float]]) -> float:
 def errors_in_words(errors: dict[str, float]) -> str:
     """Relative errors as "34 % of von Mises stress and 390 % of forces"."""
     return " and ".join(f"{100.0 * error:.0f} % of {kind}" for kind, error in errors.items())
+
+
+def unknown_mesh_error(model: ReducedModel) -> str | None:
+    """Why the error of a model's mesh was not estimated though it can be; None if it was, or nobody could.
+
+    Solutions of another program, sheets in grips and elements of the highest order have no finer ones to compare with.
+    """
+    stated = model.certificate.get("discretisation", {})
+    return stated.get(NOT_ESTIMATED) if model.study_parameters and stated.get(ESTIMABLE, False) else None
 
 
 def force_error(model: ReducedModel, support: str) -> tuple[float, bool] | None:

@@ -124,7 +124,7 @@ def build(
 
 
 def _built(study: Study, text: str, output: Path, workers: int | None, executor: Executor | None) -> ReducedModel:
-    begin = time.monotonic()
+    begin = time.thread_time()
     chosen, mesh_notes = resolve_defaults(study), []
     if isinstance(chosen, SolidStudy | ShellStudy):
         chosen.check_parameters_used()
@@ -148,7 +148,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         announce("reducing the responses to unknown loads")
         loads, model.certificate["unknown_loads"] = reduce_unknown_loads(chosen, chosen.unknown_loads, snapshots)
         model = replace(model, unknown_loads=loads)
-    model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.monotonic() - begin)
+    model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.thread_time() - begin)
     if isinstance(chosen, SolidStudy) and (deviation := study_mesh_deviation(chosen, chosen.solid_mesh())):
         model.certificate["mesh_deviation"] = deviation
     model.provenance.update(provenance(text, chosen, model))

@@ -3,8 +3,9 @@
 Viscous solids are followed again from the beginning, with half the increments of time besides.
 
 States are chosen by their strain alone, before anything is solved. How many can be afforded, in a quarter of the
-build's time or 20 seconds, follows from numbers of unknowns, so that it is the same in every run; the clock ends what
-takes longer than foreseen, and the certificate says what was left out and why.
+build's time or a minute, follows from numbers of unknowns, so that it is the same in every run; the clock ends what
+takes longer than foreseen, and the certificate says what was left out and why. Time is the processor's, of the thread
+that builds: on an idle computer it runs like a clock, however many threads help, and other programs do not count.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,15 +25,14 @@ from morph_dslam.mechanics.shell_problem import ShellOptions, ShellProblem
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
 from morph_dslam.mechanics.solvers import newton
-from morph_dslam.mechanics.solvers.continuation import loaded_state
-from morph_dslam.mechanics.solvers.linear_solver import SolverMaker
-from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
-from morph_dslam.mechanics.solvers.two_level import LowerOrder, TwoLevelSolver
+from morph_dslam.mechanics.solvers.newton import State
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.parameter_errors import ENTRY, parameter_errors
 from morph_dslam.model.reduced_model import REACTION
+from morph_dslam.model.stated_errors import ESTIMABLE, NOT_ESTIMATED
 from morph_dslam.reduction.certificate import field_errors
 from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.higher_order import HigherOrder, OutOfTime
 from morph_dslam.studies.problem import Snapshot, announce
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_study import ShellStudy
@@ -47,7 +47,9 @@ from morph_dslam.studies.viscous_sweep import ViscousSweep
 Array = NDArray[np.float64]
 #: Part of the whole build that the estimate may take, and seconds that it may take of any build: short ones consist of
 #: more than solves, and whoever waits a minute would rather know.
-SHARE, FLOOR = 0.25, 20.0
+SHARE, FLOOR = 0.25, 60.0
+#: States that are solved again where the study does not say how many.
+REFINED = 3
 #: Part of that time at which no tangent is begun any more: the last one must end, and fields be recovered.
 CLOCK = 0.8
 MOST_BYTES = 4e9
@@ -72,19 +74,22 @@ PAUSES = 40
 FINEST_SHELL = 3
 #: Fields that follow from derivatives of the displacement, and part of the nodes that must have them for an estimate.
 NODAL, FEWEST_REGULAR = {"strain", "stress_solid", "stress_top", "stress_bottom"}, 0.5
-#: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
-TOLERANCE, PART = 1e-2, 0.03
 
-
-_LIMIT = f"a quarter of the build and {FLOOR:.0f} s"
+_LIMIT = f"a quarter of the build and {FLOOR:.0f} s of processor time"
+_ASK = "give sampling.refined to have it whatever the time"
 
 
 class _NotEstimated(Exception):
-    """Why there is no estimate."""
+    """Why there is no estimate.
 
+    Attributes
+    ----------
+    estimable : whether there can be one of such a study.
+    """
 
-class OutOfTime(Exception):
-    """A solve was stopped before it ended."""
+    def __init__(self, reason: str, estimable: bool = True) -> None:
+        super().__init__(reason)
+        self.estimable = estimable
 
 
 def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedModel, seconds: float) -> dict[str, Any]:
@@ -95,7 +100,7 @@ def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedMode
     study : with its defaults resolved.
     snapshots : its solutions.
     model : made from them.
-    seconds : that the build has taken so far.
+    seconds : of processor time that the build has taken so far in this thread.
 
     Returns
     -------
@@ -104,25 +109,26 @@ def discretisation_errors(study: Study, snapshots: Snapshots, model: ReducedMode
         held-out solutions against the finer ones by field, at the nodes of the model (`certificate.field_errors`);
         "singular_nodes", the most that a finer solution has no strain or stress at, which these errors leave out;
         "parameters", what they amount to in these (`parameter_errors`); "left_out", why some states are missing. Or
-        only "not_estimated", the reason.
+        "not_estimated", the reason, and "estimable", whether another run could state one.
     """
     try:
         return _estimate(_refinable(study), snapshots, model, seconds)
     except _NotEstimated as reason:
-        return {"not_estimated": str(reason)}
+        return {NOT_ESTIMATED: str(reason), ESTIMABLE: reason.estimable}
 
 
 def _refinable(study: Study) -> SolidStudy | ShellStudy:
     """The study, if its solutions can be solved again with finer elements."""
     if isinstance(study, ExternalStudy):
-        raise _NotEstimated("the solutions are another program's")
+        raise _NotEstimated("the solutions are another program's", estimable=False)
     if isinstance(study, SheetStudy):
-        raise _NotEstimated("studies of sheets in grips have no finer elements to compare with")
-    if not study.sampling.refined:
+        raise _NotEstimated("studies of sheets in grips have no finer elements to compare with", estimable=False)
+    if study.sampling.refined == 0:
         raise _NotEstimated("switched off by sampling.refined = 0")
     if isinstance(study, ShellStudy):
         if study.solver.order >= FINEST_SHELL:
-            raise _NotEstimated(f"shells of order {study.solver.order} have no finer elements to compare with")
+            reason = f"shells of order {study.solver.order} have no finer elements to compare with"
+            raise _NotEstimated(reason, estimable=False)
         return study
     return study
 
@@ -142,69 +148,106 @@ def _estimate(
     study: SolidStudy | ShellStudy, snapshots: Snapshots, model: ReducedModel, seconds: float
 ) -> dict[str, Any]:
     assert snapshots.problem is not None
-    begin = time.monotonic()
     sweep = snapshots.problem()
     if isinstance(sweep, ViscousSweep):
         assert isinstance(study, SolidStudy)
         return _estimate_in_time(study, snapshots, model, sweep, seconds)
     assert isinstance(sweep, SolidSweep)
     solves = len(snapshots.training) + len(snapshots.held_out)
-    finer = HigherOrder(sweep.problem, _finer(study, sweep.problem))
-    chosen = chosen_states(snapshots.held_out, study.sampling.refined)
-    chosen = chosen[: _affordable(_unknowns(sweep.problem, finer.problem), solves, finer.iterative)]
+    problem = _finer(study, sweep.problem)
+    finer = HigherOrder(sweep.problem, problem, _is_too_large(problem))
+    unknowns = _unknowns(sweep.problem, finer.problem)
+    _check_memory(unknowns[1], finer.iterative)
+    chosen = _chosen(study, snapshots, partial(_affordable, unknowns, solves, finer.iterative))
     kept = {index: load_state(snapshots.held_out_files[index]) for index in chosen}
-    # Where solutions were found on disk, this build was shorter than the one that solved them.
-    solving = SWEEP_TANGENTS * _tangent_seconds(sweep.problem, kept[chosen[0]]) * solves / (study.work.workers or 1)
-    end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * max(seconds, solving), FLOOR)
+    solving = _solving_seconds(study, sweep.problem, kept[chosen[0]], solves)
     announce(f"solving {len(chosen)} held-out states again with finer elements")
 
-    def solve_again(index: int) -> Snapshot:
+    def solve_again(index: int, in_time: Callable[[], bool]) -> Snapshot:
         state, pivots = kept[index], int(kept[index]["pivots"])
-        found = finer.solve(state["dofs"], state["mu"], lambda: time.monotonic() < end)
+        found = finer.solve(state["dofs"], state["mu"], in_time)
         _check_same_branch(finer.problem, found, pivots)
         return _snapshot(finer.problem, found)
 
-    solved, left_out = _solved_again(chosen, solve_again)
+    solved, left_out = _solved_again(chosen, solve_again, _budget(study, max(seconds, solving)))
     figures = _figures(model, snapshots, sweep.problem, finer.problem, solved)
     return figures | left_out
 
 
+def _chosen(study: SolidStudy | ShellStudy, snapshots: Snapshots, affordable: Callable[[], int]) -> list[int]:
+    """The held-out states to solve again: as many as the study asks for, or by itself as many as are ``affordable``."""
+    if study.sampling.refined is not None:
+        return chosen_states(snapshots.held_out, study.sampling.refined)
+    return chosen_states(snapshots.held_out, REFINED)[: affordable()]
+
+
+def _budget(study: SolidStudy | ShellStudy, building: float) -> float:
+    """Seconds that the finer solves of a study may take, the build of which has taken ``building``."""
+    if study.sampling.refined is not None:
+        return np.inf
+    return CLOCK * max(SHARE / (1.0 - SHARE) * building, FLOOR)
+
+
+def _solving_seconds(
+    study: SolidStudy | ShellStudy, problem: SolidProblem, state: dict[str, Array], solves: float
+) -> float:
+    """Time of a build of so many ``solves``, at least.
+
+    Where solutions were found on disk, or solved in other processes, this thread has spent less.
+    """
+    return SWEEP_TANGENTS * _tangent_seconds(problem, state) * solves / (study.work.workers or 1)
+
+
 def _solved_again(
-    chosen: Sequence[int], solve_again: Callable[[int], Snapshot]
+    chosen: Sequence[int], solve_again: Callable[[int, Callable[[], bool]], Snapshot], seconds: float
 ) -> tuple[dict[int, Snapshot], dict[str, str]]:
     """Finer solutions of the ``chosen`` held-out states, by index, and as "left_out" why some are missing, if any.
 
-    Raises _NotEstimated where all are.
+    Each may take its share of what is left of the ``seconds``: one that does not converge leaves the others theirs.
+
+    Raises _NotEstimated where all are missing.
     """
-    solved, left_out = dict[int, Snapshot](), ""
-    for index in chosen:
+    solved, late, failed = dict[int, Snapshot](), 0, ""
+    begin = time.thread_time()
+    for number, index in enumerate(chosen):
+        now = time.thread_time()
+        share = (begin + seconds - now) / (len(chosen) - number)
         try:
-            solved[index] = solve_again(index)
+            solved[index] = solve_again(index, partial(_before, now + share))
         except OutOfTime:
-            left_out = f"{len(chosen) - len(solved)} of {len(chosen)} states would take more than {_LIMIT}"
-            break
+            late += 1
         except SolverError as error:
-            left_out = f"one was left out: {error}"
+            failed = f"one was left out: {error}"
+    slow = f"{late} of {len(chosen)} states would take more than {_LIMIT}: {_ASK}" if late else ""
+    left_out = "; ".join(filter(None, (failed, slow)))
     if not solved:
         raise _NotEstimated(left_out)
     return solved, {"left_out": left_out} if left_out else {}
+
+
+def _before(end: float) -> bool:
+    return time.thread_time() < end
 
 
 def _estimate_in_time(
     study: SolidStudy, snapshots: Snapshots, model: ReducedModel, sweep: ViscousSweep, seconds: float
 ) -> dict[str, Any]:
     """The same of a viscous solid, whose states are followed from the beginning."""
-    begin, finer = time.monotonic(), _finer(study, sweep.problem)
+    finer, paths = _finer(study, sweep.problem), _paths(study, snapshots)
     unknowns = _unknowns(sweep.problem, finer)
-    chosen = chosen_states(snapshots.held_out, study.sampling.refined)[: _affordable_paths(study, snapshots, unknowns)]
-    end = begin + CLOCK * max(SHARE / (1.0 - SHARE) * seconds, FLOOR)
+    _check_memory(unknowns[1], iterative=False)
+    chosen = _chosen(study, snapshots, partial(_affordable_paths, unknowns, *paths))
+    state = load_state(snapshots.held_out_files[chosen[0]])
+    assert sweep.problem.history is not None
+    sweep.problem.history.restore(state["memory"])
+    solving = _solving_seconds(study, sweep.problem, state, paths[0] * paths[1])
     announce(f"following {len(chosen)} held-out states again with finer elements and half the increments of time")
     halved = sweep.finer_in_time(finer)
 
-    def follow_again(index: int) -> Snapshot:
-        return _followed(halved, snapshots.held_out[index].coordinates, lambda: time.monotonic() < end)
+    def follow_again(index: int, in_time: Callable[[], bool]) -> Snapshot:
+        return _followed(halved, snapshots.held_out[index].coordinates, in_time)
 
-    solved, left_out = _solved_again(chosen, follow_again)
+    solved, left_out = _solved_again(chosen, follow_again, _budget(study, max(seconds, solving)))
     figures = _figures(model, snapshots, sweep.problem, finer, solved)
     figures["method"] += ", half the increments of time"
     return figures | left_out
@@ -220,27 +263,28 @@ def _followed(sweep: ViscousSweep, mu: Array, in_time: Callable[[], bool]) -> Sn
     return sweep.take_snapshot(state)
 
 
-def _affordable_paths(study: SolidStudy, snapshots: Snapshots, unknowns: list[int]) -> int:
-    """How many paths in time, with finer elements and half the increments, a quarter of the build affords.
-
-    Raises _NotEstimated where memory or time allow none.
-    """
+def _paths(study: SolidStudy, snapshots: Snapshots) -> tuple[int, float]:
+    """Number of the paths in time of a build, and of increments of each."""
     assert study.time is not None
-    own, finer = unknowns
-    if _direct_bytes(finer) > MOST_BYTES:
-        raise _NotEstimated(f"{finer} unknowns of finer elements would need about {1e-9 * _direct_bytes(finer):.0f} GB")
     clock = next(p for p in study.model_parameters() if p.name == study.time.parameter)
     solved = [group[0].coordinates for group in snapshots.training] + [s.coordinates for s in snapshots.held_out]
     others = np.delete(np.array(solved), list(study.parameters).index(clock.name), axis=1)
-    paths = len(np.unique(others, axis=0))
+    return len(np.unique(others, axis=0)), (clock.upper - clock.lower) / study.time.step
+
+
+def _affordable_paths(unknowns: list[int], paths: int, increments: float) -> int:
+    """How many paths in time, with finer elements and half the increments, a quarter of the build affords.
+
+    Raises _NotEstimated where it affords none.
+    """
+    own, finer = unknowns
     ratio = 2.0 * (finer / own) ** TIME_POWER
-    increments = (clock.upper - clock.lower) / study.time.step
     of_one = ratio * SWEEP_TANGENTS * increments * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
     count = int(max(SHARE / (1.0 - SHARE) * paths / ratio, FLOOR / of_one))
     if count < 1:
         raise _NotEstimated(
             f"one path with {finer} unknowns of finer elements would take as long as {ratio:.0f} of the build's "
-            f"{paths} paths, more than {_LIMIT}"
+            f"{paths} paths, more than {_LIMIT}: {_ASK}"
         )
     return count
 
@@ -262,17 +306,21 @@ def _check_same_branch(problem: SolidProblem, found: State, pivots: int) -> None
         )
 
 
+def _check_memory(unknowns: int, iterative: bool) -> None:
+    """Raise _NotEstimated where a finer solve of so many ``unknowns`` needs too much memory."""
+    memory = ITERATIVE_BYTES * unknowns if iterative else _direct_bytes(unknowns)
+    if memory > MOST_BYTES:
+        raise _NotEstimated(f"{unknowns} unknowns of finer elements would need about {1e-9 * memory:.0f} GB of memory")
+
+
 def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
     """How many finer states a quarter of a build of ``solves``, or `FLOOR`, can afford.
 
     ``unknowns`` are those of `_unknowns`.
 
-    Raises _NotEstimated where memory or time allow none.
+    Raises _NotEstimated where it affords none.
     """
     own, finer = unknowns
-    memory = ITERATIVE_BYTES * finer if iterative else _direct_bytes(finer)
-    if memory > MOST_BYTES:
-        raise _NotEstimated(f"{finer} unknowns of finer elements would need about {1e-9 * memory:.0f} GB of memory")
     tangents = ITERATIVE_TANGENTS * finer / own if iterative else FINER_TANGENTS * (finer / own) ** TIME_POWER
     time_of_one = tangents / SWEEP_TANGENTS
     seconds_of_one = tangents * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
@@ -280,9 +328,18 @@ def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
     if count < 1:
         raise _NotEstimated(
             f"one state with {finer} unknowns of finer elements would take as long as {time_of_one:.0f} of the build's "
-            f"{solves} solves, more than {_LIMIT}"
+            f"{solves} solves, more than {_LIMIT}: {_ASK}"
         )
     return count
+
+
+def _is_too_large(problem: SolidProblem) -> bool:
+    """Whether tangents are too large to be factorised, and an iterative solver can take them.
+
+    That is for displacements alone: pressures that cells share make the tangent indefinite.
+    """
+    n = 3 * problem.displacements.n_scalar
+    return _direct_bytes(n) > MOST_BYTES and not problem.assembly.coupled[n:].any()
 
 
 def _direct_bytes(unknowns: int) -> float:
@@ -311,117 +368,11 @@ def _tangent_seconds(problem: SolidProblem, state: dict[str, Array]) -> float:
     """Time of one tangent, its factors and a solve with them; the second one, for the first makes what is kept."""
     elapsed = []
     for _ in range(2):
-        begin = time.monotonic()
+        begin = time.thread_time()
         tangent = problem.linearise(state["dofs"], state["mu"])
         tangent.solve(tangent.residual)
-        elapsed.append(time.monotonic() - begin)
+        elapsed.append(time.thread_time() - begin)
     return min(elapsed)
-
-
-class HigherOrder:
-    """Solves the states of a solid again with displacements of higher order on the same cells.
-
-    Parameters
-    ----------
-    coarse : the solid.
-    problem : the same solid with elements of higher order.
-
-    Attributes
-    ----------
-    iterative : whether its tangents are too large to be factorised, so that `TwoLevelSolver` has to do. That is for
-        displacements alone: pressures that cells share make the tangent indefinite.
-    """
-
-    def __init__(self, coarse: SolidProblem, problem: SolidProblem) -> None:
-        self._coarse, self.problem = coarse, problem
-        n = 3 * problem.displacements.n_scalar
-        self.iterative = _direct_bytes(n) > MOST_BYTES and not problem.assembly.coupled[n:].any()
-
-    def solve(self, dofs: Array, mu: Array, in_time: Callable[[], bool] = lambda: True) -> State:
-        """The solution at ``mu`` (d,) next to one of the coarse solid, to a few percent of the difference.
-
-        First the unknowns that only the finer elements have are solved for, with the coarse solution ``dofs`` (n,)
-        held: as finer displacements this one is strained far too much in bending, and Newton's method would take long
-        from it. Where it does not converge, the forces that the start lacks for balance fade away in increments, so
-        that the solution is on the same branch.
-
-        Raises
-        ------
-        OutOfTime
-            When ``in_time`` says no: it is asked before each factorisation.
-        SolverError
-            If no solution is found.
-        """
-        make = partial(TwoLevelSolver, lower=self._lower_order(dofs, mu)) if self.iterative else None
-        equations, given = _Stoppable(self.problem, in_time, make), self._embedded(dofs)
-        start = State(mu, given)
-        try:
-            start = solve(_Added(self.problem, in_time, self._kept, given, make), mu, start, TOLERANCE)
-            # Where finer elements change nothing, a part of the change would be less than rounding.
-            tolerance = max(PART * size(equations, start.dofs - given), newton.TOLERANCE)
-            return solve(equations, mu, start, tolerance)
-        except SolverError:
-            if self.iterative:
-                raise  # a path would take as long as many states
-            return loaded_state(equations, mu, start.dofs, PART * TOLERANCE)
-
-    @cached_property
-    def _kept(self) -> NDArray[np.bool_]:
-        """The dofs (n,) that the coarse solid has too."""
-        return self._embedded(np.ones(self._coarse.n_dofs)) != 0.0
-
-    def _lower_order(self, dofs: Array, mu: Array) -> LowerOrder:
-        """The coarse solid's tangent at its solution ``dofs`` (n,)."""
-        numbers = self._embedded(np.arange(1.0, self._coarse.n_dofs + 1.0))[: self.problem.n_unknowns]
-        kept = np.flatnonzero(numbers)
-        return LowerOrder(self._coarse.linearise(dofs, mu), numbers[kept].astype(np.int64) - 1, kept)
-
-    def _embedded(self, dofs: Array) -> Array:
-        """The displacement of a coarse solution, and the motions of its couplings, as dofs (n,) of the finer solid."""
-        result = np.zeros(self.problem.n_dofs)
-        coarse = dofs[: 3 * self._coarse.displacements.n_scalar]
-        embedded = self.problem.displacements.embedded(self._coarse.displacements, coarse)
-        result[: len(embedded)] = embedded
-        result[self.problem.n_unknowns :] = dofs[self._coarse.n_unknowns :]
-        return result
-
-
-class _Stoppable:
-    """The equations of a solid, whose factorisations stop when time is up."""
-
-    def __init__(self, problem: SolidProblem, in_time: Callable[[], bool], make: SolverMaker | None) -> None:
-        self._problem, self._in_time = problem, in_time
-        self.n_dofs, self.free, self.scale = problem.n_dofs, problem.free, problem.scale
-        self.in_contact, self.applied_first = problem.in_contact, problem.applied_first
-        self.prescribed, self.prescribed_slopes = problem.prescribed, problem.prescribed_slopes
-        self.residual, self.residual_slopes = problem.residual, problem.residual_slopes
-        self._solver = problem.solver_of(problem.free, make) if make else problem.solver
-
-    def linearise(self, x: Array, mu: Array) -> Linearisation:
-        if not self._in_time():
-            raise OutOfTime
-        return self._problem.linearise(x, mu, self._solver)
-
-
-class _Added(_Stoppable):
-    """The same with the ``kept`` (n,) dofs held as in ``given`` (n,)."""
-
-    def __init__(
-        self,
-        problem: SolidProblem,
-        in_time: Callable[[], bool],
-        kept: NDArray[np.bool_],
-        given: Array,
-        make: SolverMaker | None,
-    ) -> None:
-        super().__init__(problem, in_time, make)
-        self._kept, self._given = kept, given
-        self.free, self.prescribed = problem.free & ~kept, self._held
-        self._solver = problem.solver_of(self.free, make)
-
-    def _held(self, mu: Array) -> Array:
-        prescribed = self._problem.prescribed(mu)
-        return np.where(self._kept & self._problem.free, self._given, prescribed)
 
 
 def _snapshot(problem: SolidProblem, state: State) -> Snapshot:

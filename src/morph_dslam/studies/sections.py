@@ -112,7 +112,8 @@ class SamplingSection(Section):
     ``first`` and then adds where the model's error is estimated to be largest, or, of a single parameter, in the
     middle of intervals, up to ``training``; "paths", of a study with a time, solves ``training`` paths at the same
     instants. The method of reduction chooses where it is absent. Held-out samples are always scattered.
-    ``refined`` of them are solved again with finer elements to estimate the discretisation error; 0 for none.
+    ``refined`` of them are solved again with finer elements to estimate the discretisation error, whatever time that
+    takes; 0 for none. Where it is absent, 3 are, as far as the build's own time affords them.
     """
 
     training: int = Field(default=256, ge=8, le=MOST_SAMPLES)
@@ -121,7 +122,7 @@ class SamplingSection(Section):
     points: int | tuple[int, ...] | None = None
     first: int = Field(default=16, ge=4)
     seed: int = Field(default=0, ge=0)
-    refined: int = Field(default=3, ge=0, le=MOST_REFINED)
+    refined: int | None = Field(default=None, ge=0, le=MOST_REFINED)
 
     @field_validator("points")
     @classmethod

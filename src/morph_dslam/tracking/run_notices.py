@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
+from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words, unknown_mesh_error
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
@@ -113,6 +113,11 @@ class RunWarning(StrEnum):
         "the model misses {errors} at held-out solutions of its study: do not rely on these here, "
         "whatever their deviations"
     )
+    MESH_ERROR_UNKNOWN = (
+        "the error of the model's mesh was not estimated ({reason}), and no deviation contains it: parameters and what "
+        "follows from them may be off by more than stated; build with sampling.refined = 1, or compare with a model of "
+        "smaller cells"
+    )
     REFERENCE_WIDENED = (
         "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that"
     )
@@ -187,6 +192,9 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     doubtful = doubtful_errors(run.model)
     if doubtful:
         found.append(of(RunWarning.DOUBTFUL_FIELDS, relative=doubtful, errors=errors_in_words(doubtful)))
+    mesh = unknown_mesh_error(run.model)
+    if mesh is not None:
+        found.append(of(RunWarning.MESH_ERROR_UNKNOWN, reason=mesh))
     return [*found, *_unobservable(run, held)]
 
 
