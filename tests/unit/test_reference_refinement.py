@@ -10,9 +10,10 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
+from morph_dslam.tracking.depth_registration import refine_by_depth
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.known_state import LandmarkTerm
-from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, minimum, refine_by_depth, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, minimum, refine_reference
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA, mean_error, sheet_depth, sheet_state

@@ -7,9 +7,10 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth_registration import depth_term
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.known_state import DepthTerm, LandmarkDepthTerm, LandmarkTerm
-from morph_dslam.tracking.refinement import Keyframe, depth_term
+from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.still import StillProblem, fit_still
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points

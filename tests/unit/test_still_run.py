@@ -7,9 +7,11 @@ import pytest
 
 from morph_dslam import TrackerOptions
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.tracking.state import State
 from morph_dslam.tracking.still_run import known_state
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
 
 MODEL = bent_sheet_model(7, 5)
 #: As a registration at rest has it: parameters known, the pose to so much.
@@ -34,3 +36,17 @@ def test_a_frame_at_rest_says_nothing_of_a_per_sequence_parameter(at_rest):
     found = known_state(part).covariance  # type: ignore[arg-type]
     half = 0.5 * (MODEL.upper - MODEL.lower)[1]
     np.testing.assert_allclose(np.diag(found), [0.0, half**2 if at_rest else 0.0, 0.0, *POSE_VARIANCES])
+
+
+@pytest.mark.parametrize(("fitted", "counted"), [(0.08, 0.5), (1.2, 1.2), (np.nan, 0.5)])
+def test_landmarks_count_with_half_a_pixel_at_least(fitted, counted):
+    """As in their registration: residuals do not show what the mesh is off by, which the pose takes up."""
+    nodes = MODEL.nodes[::4]
+    pose = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0]))
+    part = SimpleNamespace(
+        object=SimpleNamespace(start=Landmarks(nodes, CAMERA.project(pose.apply(nodes))), click_px=0.5),
+        registration=SimpleNamespace(state=State(MODEL.default, pose), facts={"sigma_px": fitted}),
+        model=MODEL,
+        depth=None,
+    )
+    assert known_state(part).sigma_px == counted  # type: ignore[arg-type]

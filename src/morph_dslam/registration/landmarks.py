@@ -30,6 +30,7 @@ from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
     AtBound,
+    DepthAgainstLandmarks,
     FewLandmarks,
     NotAtRest,
     PoorFit,
@@ -43,8 +44,8 @@ from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SIGMA_AT_1M
+from morph_dslam.tracking.depth_registration import refine_by_depth
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
-from morph_dslam.tracking.refinement import refine_by_depth
 
 Array = NDArray[np.float64]
 #: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse, and worse than this share
@@ -165,7 +166,8 @@ def register_landmarks(
         best, alternatives, notes = snap.corrected(best, alternatives)
         facts["corrected_by_outline"] = not notes
         covariance = covariance if notes else best.covariance
-    warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px, moved)
+    alone_px = facts["sigma_px"] if depth is not None else np.nan
+    warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px, moved, alone_px)
     warnings = (*warnings, *notes, *turned_away(model, best.state, landmarks.points))
     return Registration(model, best.state, covariance, facts=facts, warnings=warnings, alternatives=alternatives)
 
@@ -479,13 +481,17 @@ def _warnings(
     click_px: float,
     poor_px: float,
     moved: NotAtRest | None,
+    alone_px: float,
 ) -> tuple[RegistrationWarning, ...]:
+    """What a reader must know; ``alone_px`` is how the landmarks fit without depth, NaN where there is none."""
     warnings: list[RegistrationWarning] = []
     numbers, unknowns, size = 2 * len(points), len(model.parameters) + 6, _extent(model.nodes)
     if numbers <= unknowns:
         warnings.append(Underdetermined(numbers, unknowns, unknowns // 2 + 3))
     elif moved is not None:
         warnings.append(moved)
+    elif np.isfinite(alone_px) and best.sigma_px > max(poor_px, POOR_FIT * max(alone_px, click_px)):
+        warnings.append(DepthAgainstLandmarks(alone_px, best.sigma_px))
     elif best.sigma_px > poor_px:
         warnings.append(PoorFit(best.sigma_px, click_px))
     elif numbers - unknowns < ENOUGH_SPARE:

@@ -122,6 +122,25 @@ class NotAtRest(PoorFit):
 
 
 @dataclass(frozen=True)
+class DepthAgainstLandmarks(RegistrationWarning):
+    """The landmarks fit alone, and not together with the depth image.
+
+    Attributes
+    ----------
+    alone_px : standard deviation of their pixels by the fit without depth.
+    with_depth_px : the same with it.
+    """
+
+    template: ClassVar[str] = (
+        "the depth image contradicts the landmarks: alone they fit to {alone_px:.1f} px, with depth to "
+        "{with_depth_px:.1f} px. Depth is not aligned to the colour image, or of another unit or instant: "
+        "align it, or track without --depth; until then places are off by more than stated"
+    )
+    alone_px: float
+    with_depth_px: float
+
+
+@dataclass(frozen=True)
 class FewLandmarks(RegistrationWarning):
     """The landmarks are hardly more than the unknowns, so that their residuals do not show how exact they are.
 

@@ -12,17 +12,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 
-from morph_dslam.errors import RegistrationError
-from morph_dslam.sources.recorded import DEPTH_SCALE
-from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
-from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
-from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
-from morph_dslam.tracking.known_state import DepthTerm, LandmarkTerm, StateTerm
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
+from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
@@ -175,105 +172,3 @@ def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool
     scaled = np.zeros((len(met) + len(found) - int(met.sum()), 2))
     scaled[: len(met)][met], scaled[len(met) :] = found[: met.sum()], found[met.sum() :]
     return scaled.ravel()
-
-
-#: Points that are paired, how often, and how many are needed.
-POINTS, ROUNDS, LEAST = 600, 5, 30
-#: Depths farther from the surface than this share of the object's size are of something else.
-LARGEST_DISTANCE = 0.05
-#: Depth within this many pixels of the object's rim may belong to what is behind it.
-RIM_PX = 4
-
-
-def refine_by_depth(
-    estimator: Estimator,
-    landmarks: BoundPoints,
-    pixels: Array,
-    state: State,
-    sigma_px: float,
-    image: NDArray[np.float32],
-    sigma_at_1m: float = SIGMA_AT_1M,
-) -> Estimate:
-    """The state of an object from landmarks and a depth image of the same view, as in iterative closest points.
-
-    Parameters
-    ----------
-    landmarks : p of them, bound
-    pixels : (p, 2) of them in the undistorted image.
-    state : as the landmarks have it
-    sigma_px : how exactly they were set.
-    image : (h, w) as recorded, metres, NaN where unknown.
-
-    Raises
-    ------
-    RegistrationError
-        If there is hardly any depth where the landmarks have the object.
-    """
-    found = None
-    for _ in range(ROUNDS):
-        points, places, measured, near = _depths_in_view(estimator, state, image, sigma_px**2, sigma_at_1m)
-        depths = measured.only(near)
-        if depths.count < LEAST:
-            ratio = measured.ratio_to(points.in_camera(state)[:, 2])
-            found_there = (
-                "none was measured on it" if ratio is None else f"the measured ones are {ratio:.3g} times those"
-            )
-            raise RegistrationError(
-                f"only {depths.count} of {len(points)} points on the object have a depth near the one that the "
-                f"landmarks give; {found_there}. Is the depth registered to this camera? If not, do that first; else "
-                f"correct --depth-per-metre, {DEPTH_SCALE}, or the landmarks"
-            )
-        found = estimator.estimate(
-            points.joined(landmarks),
-            np.concatenate([places, pixels]),
-            np.concatenate([np.zeros(len(points)), np.ones(len(landmarks))]),
-            state,
-            depths=depths.padded(len(points) + len(landmarks)),
-        )
-        state = found.state
-    assert found is not None
-    return found
-
-
-def depth_term(
-    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float = SIGMA_AT_1M
-) -> DepthTerm:
-    """What a depth image says of the object's state in its frame, as a term beside those of other frames.
-
-    Its points count for as many as those of a keyframe do, each with what depth shows there if that is more than noise.
-
-    Parameters
-    ----------
-    state : near to which the object is, as registered with this image.
-    image : (h, w) as recorded, metres, NaN where unknown.
-    """
-    points, places, measured, near = _depths_in_view(estimator, state, image, 1.0, sigma_at_1m)
-    depths = measured.only(near)
-    variance = depths.variance_px(depths.terms(points, state)[3])
-    share = np.sqrt(min(EFFECTIVE_POINTS / max(depths.count, 1), 1.0) / variance)
-    return DepthTerm(estimator.model, estimator.camera.distort_pixels(places), depths, float(share))
-
-
-def _depths_in_view(
-    estimator: Estimator, state: State, image: NDArray[np.float32], squared_px: float, sigma_at_1m: float
-) -> tuple[BoundPoints, Array, PointDepths, NDArray[np.bool_]]:
-    """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near."""
-    points, places = _surface_in_view(estimator, state)
-    seen = np.ones(len(points), dtype=bool)
-    depths = PointDepths.sampled(image, places, seen, estimator.camera, squared_px, sigma_at_1m)
-    size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-    near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
-    return points, places, depths, near
-
-
-def _surface_in_view(estimator: Estimator, state: State) -> tuple[BoundPoints, Array]:
-    """Points spread over what the camera sees of the surface, and their pixels (p, 2)."""
-    model, camera = estimator.model, estimator.camera
-    view = view_of(model, camera, state)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
-    covered = cv2.erode(draw_view(view, model.triangles, camera).covered.astype(np.uint8), disc)
-    rows, columns = np.nonzero(covered)
-    chosen = np.random.default_rng(0).permutation(len(rows))[:POINTS]
-    pixels = np.column_stack([columns[chosen], rows[chosen]]).astype(float)
-    surface, met = bind_pixels(model, camera, view, pixels)
-    return BoundPoints.from_surface(model, surface), pixels[met]

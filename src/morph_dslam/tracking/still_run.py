@@ -14,6 +14,7 @@ from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.landmarks import bind_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.depth_registration import depth_term
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.known_state import LandmarkDepthTerm, LandmarkTerm, StateTerm
@@ -21,7 +22,7 @@ from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.options import PoseFrom
 from morph_dslam.tracking.placement import PlacedObject
-from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, depth_term, landmark_deviation
+from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, landmark_deviation
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
 from morph_dslam.tracking.still_notices import still_notices
@@ -88,7 +89,8 @@ def known_state(part: PlacedObject) -> LandmarkTerm | StateTerm:
     landmarks, registration = part.object.start, part.registration
     if not isinstance(landmarks, Landmarks) or registration.facts.get("corrected_by_outline", False):
         return _state_term(part, _covariance_of_first_frame(part))
-    sigma = landmark_deviation(registration.facts["sigma_px"])
+    # As in the registration: a few that happen to fit well, or that a wrong mesh fits, are not exact for that.
+    sigma = max(landmark_deviation(registration.facts["sigma_px"]), part.object.click_px)
     bound = bind_landmarks(part.model, landmarks.points)
     if part.depth is None:
         return LandmarkTerm(bound, landmarks.pixels, sigma)

@@ -1,0 +1,175 @@
+"""An object's state by the depth image of the frame in which it is registered.
+
+A fixed pixel's depth is compared with that of the surface that the pixel sees. Where the surface slopes, that changes
+as the surface moves sideways too, so the derivatives are those with the pixel's point found anew in each state. With
+those of one material point, as of points whose pixels are measured, a sheet turned by 40 degrees ends millimetres off.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime
+
+from morph_dslam.errors import RegistrationError
+from morph_dslam.sources.recorded import DEPTH_SCALE
+from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
+from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
+from morph_dslam.tracking.known_state import DepthTerm
+from morph_dslam.tracking.levenberg_marquardt import Minimum
+from morph_dslam.tracking.refinement import DIFFERENCE, EFFECTIVE_POINTS, minimum
+
+Array = NDArray[np.float64]
+#: Points that are compared, how often they are chosen anew, and how many are needed.
+POINTS, ROUNDS, LEAST = 600, 3, 30
+#: Unknowns are searched for in steps of this share of their scale.
+STEP = 1e-2
+#: Depths farther from the surface than this share of the object's size are of something else.
+LARGEST_DISTANCE = 0.05
+#: Depth within this many pixels of the object's rim may belong to what is behind it.
+RIM_PX = 4
+
+
+def refine_by_depth(
+    estimator: Estimator,
+    landmarks: BoundPoints,
+    pixels: Array,
+    state: State,
+    sigma_px: float,
+    image: NDArray[np.float32],
+    sigma_at_1m: float = SIGMA_AT_1M,
+) -> Estimate:
+    """The state of an object from landmarks and a depth image of the same view.
+
+    Parameters
+    ----------
+    landmarks : k of them, bound.
+    pixels : (k, 2) of them in the undistorted image.
+    state : as the landmarks have it.
+    sigma_px : how exactly they were set.
+    image : (h, w) as recorded, metres, NaN where unknown.
+
+    Raises
+    ------
+    RegistrationError
+        If there is hardly any depth where the landmarks have the object.
+    """
+    found = None
+    for _ in range(ROUNDS):
+        points, places, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m)
+        depths = measured.only(near)
+        if depths.count < LEAST:
+            ratio = measured.ratio_to(points.in_camera(state)[:, 2])
+            there = "none was measured on it" if ratio is None else f"the measured ones are {ratio:.3g} times those"
+            raise RegistrationError(
+                f"only {depths.count} of {len(points)} points on the object have a depth near the one that the "
+                f"landmarks give; {there}. Is the depth registered to this camera? If not, do that first; else correct "
+                f"--depth-per-metre, {DEPTH_SCALE}, or the landmarks"
+            )
+        term = _term(estimator, state, points, places, depths)
+        found = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state).minimum()
+        state = found.state
+    assert found is not None
+    return estimator.finished(found, np.ones(len(pixels)), np.full(len(pixels), 2))
+
+
+class _DepthFit:
+    """Residuals of landmarks and depth as a function of steps from a state."""
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        landmarks: BoundPoints,
+        pixels: Array,
+        sigma_px: float,
+        term: DepthTerm,
+        start: State,
+    ) -> None:
+        self._estimator, self._landmarks, self._pixels = estimator, landmarks, pixels
+        self._sigma_px, self._term, self._start = sigma_px, term, start
+        self._scale = STEP * estimator.box.scale
+
+    def minimum(self) -> Minimum:
+        """Where both fit best, parameters that are known held; the Hessian is that of all unknowns."""
+        box, d = self._estimator.box, len(self._start.parameters)
+        free = np.concatenate([box.upper > box.lower, np.ones(6, dtype=bool)])
+        columns = np.eye(d + 6)[:, free]
+        bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
+        bounds[:, :d] = (np.array([box.lower, box.upper]) - self._start.parameters) / self._scale[:d]
+        bounds += np.array([[-1e-6], [1e-6]])
+        lower, upper = bounds[:, free]
+        found = minimum(lambda step: self._residuals(columns @ step), np.zeros(columns.shape[1]), (lower, upper), 10)
+        step = columns @ found.x
+        slopes = np.asarray(approx_fprime(step, self._residuals, DIFFERENCE)) / self._scale
+        variance, converged = self._sigma_px**2, found.status > 0
+        hessian = variance * slopes.T @ slopes
+        return Minimum(self._at(step), variance * found.cost, hessian, self._away(step), found.nfev, converged)
+
+    def _at(self, step: Array) -> State:
+        return self._estimator.box.nearest(moved(self._start, step * self._scale))
+
+    def _away(self, step: Array) -> Array:
+        """How far the landmarks are from their pixels (k, 2)."""
+        return self._estimator.camera.project(self._landmarks.in_camera(self._at(step))) - self._pixels
+
+    def _residuals(self, step: Array) -> Array:
+        """Of landmarks and depths, in standard deviations."""
+        away, huber = self._away(step), self._estimator.options.huber_px
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        away = away * np.sqrt(np.minimum(1.0, huber / np.maximum(length, 1e-12))) / self._sigma_px
+        return np.concatenate([away.ravel(), self._term.residuals(self._estimator.camera, self._at(step))])
+
+
+def depth_term(
+    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float = SIGMA_AT_1M
+) -> DepthTerm:
+    """What a depth image says of the object's state in its frame, as a term beside those of other frames.
+
+    Parameters
+    ----------
+    state : near to which the object is, as registered with this image.
+    image : (h, w) as recorded, metres, NaN where unknown.
+    """
+    points, places, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m)
+    return _term(estimator, state, points, places, measured.only(near))
+
+
+def _term(estimator: Estimator, state: State, points: BoundPoints, places: Array, depths: PointDepths) -> DepthTerm:
+    """Depths as a term that counts for as many points as a keyframe does.
+
+    What a mesh is off by is alike over wide parts of it. Each counts with what depth shows there if that is more than
+    noise.
+    """
+    variance = depths.variance_px(depths.terms(points, state)[3])
+    share = np.sqrt(min(EFFECTIVE_POINTS / max(depths.count, 1), 1.0) / variance)
+    return DepthTerm(estimator.model, estimator.camera.distort_pixels(places), depths, float(share))
+
+
+def _depths_in_view(
+    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float
+) -> tuple[BoundPoints, Array, PointDepths, NDArray[np.bool_]]:
+    """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near it.
+
+    Depths have weights in standard deviations.
+    """
+    points, places = _surface_in_view(estimator, state)
+    seen = np.ones(len(points), dtype=bool)
+    depths = PointDepths.sampled(image, places, seen, estimator.camera, 1.0, sigma_at_1m)
+    size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
+    near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
+    return points, places, depths, near
+
+
+def _surface_in_view(estimator: Estimator, state: State) -> tuple[BoundPoints, Array]:
+    """Points spread over what the camera sees of the surface, and their pixels (p, 2)."""
+    model, camera = estimator.model, estimator.camera
+    view = view_of(model, camera, state)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
+    covered = cv2.erode(draw_view(view, model.triangles, camera).covered.astype(np.uint8), disc)
+    rows, columns = np.nonzero(covered)
+    chosen = np.random.default_rng(0).permutation(len(rows))[:POINTS]
+    pixels = np.column_stack([columns[chosen], rows[chosen]]).astype(float)
+    surface, met = bind_pixels(model, camera, view, pixels)
+    return BoundPoints.from_surface(model, surface), pixels[met]

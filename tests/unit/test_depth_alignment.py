@@ -1,0 +1,53 @@
+"""A depth image that does not belong to the colour image's pixels is named, and one that does is not."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.registration.landmarks import register_landmarks
+from morph_dslam.registration.messages import DepthAgainstLandmarks, PoorFit
+from morph_dslam.tracking.estimator import State
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, mean_error, sheet_depth
+
+MODEL = bent_sheet_model(22, 16)
+#: Turned far from the image plane, so that depth that is shifted is of another distance.
+POSE = RigidTransform(rotation_exp(np.array([0.1, 0.7, 0.0])) @ UPRIGHT, np.array([0.0, 0.0, 0.7]))
+BENT = State(np.array([0.04, 0.2, 0.1]), POSE)
+
+
+def registered(seed, shift_px, landmark_px=0.5):
+    """Sixteen landmarks, and a depth image whose columns are shifted."""
+    rng = np.random.default_rng(seed)
+    rows = rng.choice(len(MODEL.nodes), 16, replace=False)
+    pixels = CAMERA.project(POSE.apply(MODEL.positions(BENT.parameters)[rows]))
+    landmarks = Landmarks(MODEL.nodes[rows], pixels + landmark_px * rng.standard_normal(pixels.shape))
+    return register_landmarks(MODEL, CAMERA, landmarks, depth=np.roll(sheet_depth(MODEL, BENT, rng), shift_px, axis=1))
+
+
+def kinds(registration):
+    return {type(warning) for warning in registration.warnings} & {DepthAgainstLandmarks, PoorFit}
+
+
+def test_depth_that_is_shifted_is_named_and_not_the_landmarks():
+    found = registered(0, 25)
+    assert kinds(found) == {DepthAgainstLandmarks}
+    (said,) = (w for w in found.warnings if isinstance(w, DepthAgainstLandmarks))
+    assert said.alone_px == pytest.approx(0.5, rel=0.5)
+    assert said.with_depth_px > 2.0 * said.alone_px
+    assert "not aligned" in said.text
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_depth_that_is_aligned_is_not_named(seed):
+    """On a surface turned far from the image plane too, where landmarks alone leave some millimetres."""
+    found = registered(seed, 0)
+    assert kinds(found) == set()
+    assert mean_error(MODEL, found.state, BENT) < 0.6e-3
+    away = found.state.camera_from_object.translation - POSE.translation
+    assert (np.abs(away) < 3.5 * np.sqrt(np.diag(found.covariance)[-3:])).all()
+
+
+def test_landmarks_that_do_not_fit_alone_are_named_themselves():
+    assert kinds(registered(1, 0, landmark_px=3.0)) == {PoorFit}
