@@ -1,6 +1,7 @@
 """The studio over HTTP, step by step, without a browser."""
 
 import http.client
+import inspect
 import io
 import json
 import re
@@ -20,6 +21,9 @@ from PIL import Image
 from morph_dslam import Board, Camera, load_study, save_model
 from morph_dslam.extend.geometry import RigidTransform, rotation_exp
 from morph_dslam.extend.mechanics import load_mesh
+from morph_dslam.studio.project import UPLOADS
+from morph_dslam.studio.steps import Steps
+from tests.support.documents import PROJECT, samples
 from tests.support.processes import ended_at_last
 from tests.support.rendered_board import board_image, board_poses
 from tests.support.stretched_block import stretched_block_model
@@ -142,6 +146,37 @@ def test_a_camera_file_of_another_size_is_named_before_the_start(tmp_path):
         assert client.upload("camera", "phone.yaml", text.format(640, 480).encode()) == 200
         state = client.state()
         assert (state["notes"]["camera"], state["done"]["camera"]) == (None, True)
+
+
+def test_the_documented_script(tmp_path, monkeypatch):
+    """Its study says nothing of the material, so that the build ends at once and the script with it."""
+    monkeypatch.chdir(tmp_path)
+    write_part(Path("part.inp"))
+    Path("study.toml").write_text('name = "part"\n\n[mesh]\nfile = "mesh.inp"\nunit = "mm"\n')
+    (text,) = samples("studio", "python")
+    with running_studio(tmp_path / "project") as server:
+        told = text.replace("http://127.0.0.1:8766/?token=...", server.address)
+        assert told != text
+        with pytest.raises(SystemExit, match=r"study\.toml.*material"):
+            exec(compile(told, "studio", "exec"), {})
+        project = tmp_path / "project"
+        assert (project / "study.toml").read_text() == Path("study.toml").read_text()
+        assert load_mesh(project / "mesh.inp", "mm").n_cells == load_mesh(Path("part.inp"), "mm").n_cells
+        assert Client(server).state()["job"]["command"] == "morph build study.toml -o model.morph"
+
+
+def test_every_documented_action_is_one(server):
+    """With the arguments that the table says."""
+    page = (PROJECT / "docs" / "studio.md").read_text().partition("## By a script")[2].partition("## Who can")[0]
+    rows = re.findall(r"^\| (`[a-z_`, ]+) \| (.*) \|$", page.partition("| action |")[2], re.MULTILINE)
+    actions = {name: words for names, words in rows for name in re.findall(r"`(\w+)`", names)}
+    assert len(actions) == 21
+    known = Steps(server.project).actions
+    arguments = {each for name in actions for each in inspect.signature(known[name]).parameters}
+    named = {word for words in actions.values() for word in re.findall(r"`(\w+)`", words)}
+    assert named - {"notes", "pairs", "scan"} <= arguments
+    kinds = re.search(r"kinds are (.*) \|", page)[1]
+    assert set(re.findall(r"`(\w+)`", kinds)) == set(UPLOADS)
 
 
 def test_faces_grow_up_to_an_angle(client, folder):

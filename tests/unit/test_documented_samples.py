@@ -359,7 +359,7 @@ def test_a_simulated_sequence_is_tracked_in_memory(tmp_path, monkeypatch):
 
 
 def test_every_program_is_run_by_a_test():
-    """In `test_docs` (model-file, solid-study), `test_slam`, `test_own_program`, tests/tutorials, and others."""
+    """In `test_docs` (model-file, solid-study), `test_slam`, `test_own_program`, `test_studio`, and others."""
     run_elsewhere = {"README", "quick-start", "extending"}
     pages = [page for page in PAGES if "tutorials" not in page and page not in run_elsewhere]
     counts = {page: len(samples(page, "python")) for page in pages}
@@ -377,6 +377,7 @@ def test_every_program_is_run_by_a_test():
         "solid-study": 3,
         "sources": 1,
         "streams": 1,
+        "studio": 1,
     }
 
 
