@@ -206,8 +206,9 @@ def test_results_are_those_of_the_run_folder(tracked):
 def test_a_run_that_fails_at_once_leaves_the_results_of_the_one_before(tracked):
     client, folder = tracked
     before, drawn = client.call("tracked_frames"), client.call("overlay", frame=3)["pixels"]
-    other = GOOD_CAMERA.replace("640", "1280").replace("480", "960")
+    other = GOOD_CAMERA.replace("528.0", "700.0")
     assert client.upload("camera", "other.yaml", other.encode()) == 200
+    client.call("save_start", pairs=pairs_of(bent_sheet_model(), STATES[0]), frame=70, at_rest=False)  # there is none
     client.call("track")
     assert ended_job(client)["status"] == 2
     assert client.call("tracked_frames") == before
