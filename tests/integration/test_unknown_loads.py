@@ -25,7 +25,7 @@ from morph_dslam.meshing.generators import block
 from morph_dslam.model import Parameter, load_model, save_model
 from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.model.reduced_model import REACTION, spread_over
-from morph_dslam.model.unknown_loads import LOADS, node_areas, with_unknown_loads
+from morph_dslam.model.unknown_loads import LOADS, node_areas, supports_beside_loads, with_unknown_loads
 from morph_dslam.studies.build import build_warnings
 from morph_dslam.tracking.compact_loads import (
     LoadCovariance,
@@ -37,7 +37,11 @@ from morph_dslam.tracking.compact_loads import (
 )
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State
 from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
+from morph_dslam.tracking.outcomes import Rejection, RejectionReason, Status
 from morph_dslam.tracking.reactions import Reactions
+from morph_dslam.tracking.result import FrameResult
+from morph_dslam.tracking.run_notices import RunWarning, notices_of
+from morph_dslam.tracking.run_results import RunResults
 
 STUDY = {
     "name": "soft block",
@@ -346,6 +350,22 @@ def test_mistakes_are_one_message(file, tmp_path, capsys):
         with_unknown_loads(bare)
     assert cli.main(["info", str(file)]) == 0
     assert re.search(r"unknown loads", capsys.readouterr().out)
+
+
+def test_supports_that_move_beside_loads_are_named(loaded):
+    """The base is far from the loads on top, and stands still; an edge of the top moves with the shear."""
+    height = loaded.nodes[:, 2]
+    assert supports_beside_loads(loaded) == []
+    edge = np.flatnonzero((height == height.max()) & (loaded.nodes[:, 0] == loaded.nodes[:, 0].max()))
+    named = replace(loaded, supports=loaded.supports | {"edge": edge})
+    assert supports_beside_loads(named) == ["edge"]
+    sides = np.flatnonzero((height > height.min()) & (height < height.max()))
+    assert supports_beside_loads(replace(loaded, supports={"z_min": loaded.supports["z_min"], LOADS: sides})) == []
+    assert supports_beside_loads(loaded.without_loads) == []
+    run = RunResults(named, 0)
+    run.add(0, 0.0, FrameResult(named, Status.LOST, rejection=Rejection(RejectionReason.FEW_FEATURES)))
+    (notice,) = [notice for notice in notices_of(run) if notice.warning is RunWarning.LOADS_BESIDE_SUPPORT]
+    assert "up to the edge of 'edge'" in notice.text
 
 
 def test_places_that_are_held_have_no_loads():

@@ -132,6 +132,46 @@ def test_a_camera_that_was_moved_is_told_from_another_model_by_the_one_shift_of_
     assert shift_of(exact + 0.2 * noise) == 0.0
 
 
+def beyond_reference(model, estimator, pixels, off, push, rng):
+    """Of a later frame whose points were bound in the state ``off`` and moved by ``push`` (p, 2); noise is 0.15 px."""
+    true_points = bound(model, REFERENCE, pixels)
+    seen = CAMERA.project(true_points.in_camera(LATER)) + push + 0.15 * rng.standard_normal(pixels.shape)
+    points, weights = bound(model, off, pixels), np.ones(len(pixels))
+    errors = errors_of(estimator, points, off, np.diag(SPREAD**2))
+    found = estimator.estimate(points, seen, weights, LATER)
+    left = errors.unexplained(found, weights > 0.0)
+    for _ in range(5):
+        errors.added(found, weights, left.px)
+    return errors, left, found
+
+
+def test_an_error_of_the_reference_is_not_laid_on_the_model(model, estimator, pixels):
+    """Noise alone, and three times as many deviations off as stated, in random directions."""
+    rng, factors = np.random.default_rng(21), []
+    for times in np.repeat([0.0, 3.0], 20):
+        off = moved(REFERENCE, times * SPREAD * rng.standard_normal(9))
+        errors, left, _ = beyond_reference(model, estimator, pixels, off, 0.0, rng)
+        assert not left.is_failure
+        assert not errors.beyond_reference.is_failure, (times, errors.beyond_reference)
+        factors.append(errors.reference_factor)
+    assert np.sqrt(np.mean(np.square(factors[20:]))) > 1.5, "the residuals are wide, and the reference has the blame"
+
+
+def test_a_push_that_the_model_lacks_is_found_where_the_fit_hides_most_of_it(model, estimator, pixels):
+    """A bump in the images as a finger makes it, after which less than half a pixel is left in common."""
+    rng = np.random.default_rng(22)
+    middle, width = pixels.mean(axis=0), 0.5 * np.std(pixels[:, 0])
+    away = pixels - middle - [width, 0.0]
+    push = np.outer(4.0 * np.exp(-0.5 * np.sum(away**2, axis=1) / width**2), [0.6, 0.8])
+    errors, left, found = beyond_reference(model, estimator, pixels, REFERENCE, push, rng)
+    assert left.px < 0.5
+    assert not left.is_failure
+    assert errors.beyond_reference.is_failure
+    estimated = found.state.camera_from_object.apply(model.positions(found.state.parameters))
+    truth = LATER.camera_from_object.apply(model.positions(LATER.parameters))
+    assert np.linalg.norm(estimated - truth, axis=1).max() > 3e-3
+
+
 def test_a_failure_of_the_model_widens_the_deviations(model, estimator, pixels):
     points = bound(model, REFERENCE, pixels)
     errors = errors_of(estimator, points, REFERENCE, None)

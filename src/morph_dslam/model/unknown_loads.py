@@ -30,6 +30,8 @@ ROOT = "compliance_root"
 LOADS = "unknown loads"
 #: A load's compliance is at least this share of the mean of all.
 LEAST_COMPLIANCE = 1e-9
+#: A support whose nodes move by a smaller share of the largest displacement stands still.
+STILL = 1e-6
 #: The search for coefficients ends at so many standard deviations.
 SPAN = 10.0
 
@@ -317,3 +319,17 @@ def _one_by_one(stacked: SeparatedField, c: int) -> NDArray[np.floating]:
     """Modes (k r, n, c) of each of k fields that are stacked as components: r modes (r, n, k c)."""
     r, n, columns = stacked.modes.shape
     return np.moveaxis(stacked.modes.reshape(r, n, columns // c, c), 2, 0).reshape(-1, n, c)
+
+
+def supports_beside_loads(model: ReducedModel) -> list[str]:
+    """Names of the supports that the study moves, and which share cells of the surface with the unknown loads."""
+    if model.energy is None:
+        return []
+    modes, found = model.displacement.modes, list[str]()
+    least = STILL * max(float(modes.max(initial=0.0)), -float(modes.min(initial=0.0)))
+    loaded = np.isin(model.triangles, model.supports[LOADS]).any(axis=1)
+    for name, held in model.supports.items():
+        beside = bool((np.isin(model.triangles, held).any(axis=1) & loaded).any())
+        if name != LOADS and beside and float(np.abs(modes[:, held]).max(initial=0.0)) > least:
+            found.append(name)
+    return found

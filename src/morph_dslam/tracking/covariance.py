@@ -58,6 +58,7 @@ class SharedErrors:
         apart = [np.abs(column[:, None] - column[None]) for column in places[self._compared].T]
         near = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2 < (PAIR_SHARE * spread) ** 2
         beside = np.maximum(np.maximum(apart[0], apart[1]), apart[2]) >= window
+        self._redundancy = _redundancy(apart, window)
         # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is.
         self._pairs = (near & beside).astype(np.float64)
         factor = self.factor[self._compared]
@@ -75,6 +76,16 @@ class SharedErrors:
         found = np.tensordot(some, beside, axes=([0, 1], [0, 1])) / max(2.0 * n_pairs, 1.0)
         return np.asarray(found, dtype=np.float64)
 
+    def chance(self, variance: float, n_pairs: float) -> float:
+        """Standard deviation of what `in_common` shows where only points whose windows overlap err alike.
+
+        Parameters
+        ----------
+        variance : of each coordinate
+        n_pairs : as of `n_pairs`
+        """
+        return self._redundancy * variance / float(np.sqrt(max(n_pairs, 1.0)))
+
     def gradients(self, weighted_jacobian: Array) -> Array:
         """Gradients (2 r, n) by each direction of an error of one pixel, by J' W (p, 2, n).
 
@@ -87,7 +98,7 @@ class SharedErrors:
     def share_left(self, used: NDArray[np.bool_], jacobian: Array, gradients: Array, gain: Array) -> float:
         """How much of such an error's variance an estimate leaves in the residuals that show it.
 
-        With G = J H^-1 J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
+        With G = J gain J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
         is summed over the pairs of points that `in_common` sums over.
 
         Parameters
@@ -95,17 +106,23 @@ class SharedErrors:
         used : (p,)
         jacobian : (p, 2, n), zero if unused
         gradients : (2 r, n) as of `gradients`.
-        gain : (n, n) H^-1.
+        gain : (n, n) H^-1, or how else the unknowns follow from J' W r.
         """
         some, jacobian, factor = used[self._compared], jacobian[self._compared], self.factor[self._compared]
-        taken_up = (gradients @ gain).reshape(-1, 2, len(gain))
+        taken_up = (gradients @ gain.T).reshape(-1, 2, len(gain))
         spread = (factor @ taken_up.reshape(len(taken_up), -1)).reshape(jacobian.shape)
         beside = (self._pairs @ jacobian.reshape(len(jacobian), -1)).reshape(jacobian.shape)
         whole = 2.0 * float(some @ self._alike_pairs @ some)
         taken = 2.0 * float(np.sum(beside[some] * spread[some]))
         products = np.tensordot(jacobian, beside, axes=([0, 1], [0, 1]))
-        twice = float(np.sum(products * (gain @ (gradients.T @ gradients) @ gain)))
+        twice = float(np.sum(products * (gain @ (gradients.T @ gradients) @ gain.T)))
         return max((whole - taken + twice) / max(2.0 * self.n_pairs(used), 1.0), LEAST_LEFT)
+
+
+def _redundancy(apart: list[Array], window: int) -> float:
+    """How many points (p,) err as one, by how much their windows overlap; ``apart`` (p, p) by coordinate."""
+    shared = np.prod([np.maximum(1.0 - distance / window, 0.0) for distance in apart], axis=0)
+    return float(shared.sum()) / max(len(shared), 1)
 
 
 def gaussian_factor(places: Array, length: float) -> Array:

@@ -141,7 +141,8 @@ def _with_systematic_errors(
     warnings: list[TrackingWarning] = [*refuted]
     if doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
-    if left.is_failure:
+    beyond = systematic.beyond_reference
+    if left.is_failure or (beyond is not None and beyond.is_failure):
         shift_px = systematic.common_shift(hypothesis.estimate, hypothesis.weights)
         warnings.append(ModelDoesNotExplain(left.px, shift_px))
     if systematic.reference_factor > CLEARLY_WORSE:

@@ -13,12 +13,9 @@ from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.outcomes import KnownRefuted
-from morph_dslam.tracking.systematic_errors import SystematicErrors
+from morph_dslam.tracking.systematic_errors import REFUTED, SystematicErrors
 
 Array = NDArray[np.float64]
-#: By so many standard deviations of both together the images refute a value. A right one is off by more in one frame of
-#: 15000 if errors are Gaussian; those of the registration are the same in all frames.
-REFUTED = 4.0
 
 
 def refuted_values(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words, unknown_mesh_error
+from morph_dslam.model.unknown_loads import supports_beside_loads
 from morph_dslam.notices import Notice
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
@@ -71,8 +72,10 @@ class RunWarning(StrEnum):
     )
     MODEL_FAILS = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
-        "frames, first in frame {first}: there the object deforms otherwise, as by another law, support or shape, a "
-        "crack or a slip, or the camera is another one, or, with --still, it or the support was moved"
+        "frames, first in frame {first}: there the object deforms otherwise, as by something that touches it and is "
+        "not in the study (try --unknown-loads, or --discrepancy), by another law, support or shape, a crack or a "
+        "slip, or the camera is another one, or, with --still, it or the support was moved; what is not seen may be "
+        "off by much more than its deviations"
     )
     SHIFTED = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
@@ -117,6 +120,11 @@ class RunWarning(StrEnum):
         "the error of the model's mesh was not estimated ({reason}), and no deviation contains it: parameters and what "
         "follows from them may be off by more than stated; build with sampling.refined = 1, or compare with a model of "
         "smaller cells"
+    )
+    LOADS_BESIDE_SUPPORT = (
+        "unknown loads are sought up to the edge of {supports}, which the study moves: what acts on both sides of such "
+        "an edge looks alike, so that forces of either may be off by much more than their deviations; leave a margin "
+        "about it out of the surface of [unknown_loads], or do not rely on these forces"
     )
     REFERENCE_WIDENED = (
         "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that"
@@ -189,6 +197,9 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     factor = float(np.max(run.reference_factors(), initial=1.0))
     if factor > CLEARLY_WORSE:
         found.append(of(RunWarning.REFERENCE_WIDENED, factor=factor))
+    beside = supports_beside_loads(run.model)
+    if beside:
+        found.append(of(RunWarning.LOADS_BESIDE_SUPPORT, supports=" and ".join(f"'{name}'" for name in beside)))
     doubtful = doubtful_errors(run.model)
     if doubtful:
         found.append(of(RunWarning.DOUBTFUL_FIELDS, relative=doubtful, errors=errors_in_words(doubtful)))

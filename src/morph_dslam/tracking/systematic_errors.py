@@ -41,6 +41,9 @@ FLOOR_PX = 0.05
 MEMORY = 600.0
 #: More than so many times the stated deviation of the reference is a warning.
 CLEARLY_WORSE = 2.0
+#: What is so many of its standard deviations from what is said of it refutes that. A right one is off by more in one
+#: frame of 15000 if errors are Gaussian; those of the registration are the same in all frames.
+REFUTED = 4.0
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
@@ -79,6 +82,33 @@ class Unexplained:
 
 
 @dataclass(frozen=True)
+class BeyondReference:
+    """What is left of the residuals that no error of the reference state leaves, however large.
+
+    Attributes
+    ----------
+    common : variance of a pixel coordinate that neighbours have in common in it, px²; by chance negative too
+    chance : its standard deviation where only noise is left, px²
+    share : how much of a model's error is left in it
+    noise : variance of a pixel coordinate that neighbours do not have in common, px²
+    """
+
+    common: float
+    chance: float
+    share: float
+    noise: float
+
+    @property
+    def is_failure(self) -> bool:
+        """Whether it is the model's doing, whose whole error is then large, and larger than noise.
+
+        An estimate takes up most of a model's error by a wrong pose and shape: what is left may be small.
+        """
+        whole = self.common / self.share
+        return self.common > REFUTED * self.chance and whole > max(UNEXPLAINED_PX**2, self.noise)
+
+
+@dataclass(frozen=True)
 class Linearization:
     """A frame's points about its estimate; all is zero for those that do not count.
 
@@ -88,12 +118,14 @@ class Linearization:
     residuals : (p, 2), pixels
     jacobian : (p, 2, d + 6) of the pixels
     weighted_jacobian : (p, 2, d + 6), that times the weights
+    weights : (p,) with Huber's factor
     """
 
     usable: NDArray[np.bool_]
     residuals: Array
     jacobian: Array
     weighted_jacobian: Array
+    weights: Array
 
     @property
     def hessian(self) -> Array:
@@ -109,6 +141,15 @@ class Linearization:
         """What an estimate that moves by ``transfer`` (d + 6, m) leaves of motions (p, 2, m) of the pixels."""
         taken = self.jacobian.reshape(-1, len(transfer)) @ transfer
         return np.where(self.usable[:, None, None], moved - taken.reshape(moved.shape), 0.0)
+
+    def with_unknowns(self, moved: Array) -> Linearization:
+        """As if there were more unknowns, by which the pixels move by ``moved`` (p, 2, c)."""
+        weighted = self.weights[:, None, None] * moved
+        return replace(
+            self,
+            jacobian=np.concatenate([self.jacobian, moved], axis=2),
+            weighted_jacobian=np.concatenate([self.weighted_jacobian, weighted], axis=2),
+        )
 
 
 class ReferenceMisfit:
@@ -148,6 +189,10 @@ class SystematicErrors:
     parts : the reference images that they were bound in
     window : side of the square that is compared around a point, pixels
     still : whether the reference view's pose is that of every frame, with the same error
+
+    Attributes
+    ----------
+    beyond_reference : of the last frame; None where that does not tell.
     """
 
     def __init__(
@@ -163,6 +208,7 @@ class SystematicErrors:
             self._inverse_edges = (adjugate / size[:, None]).reshape(-1, 2, 2)
         self._moved, self._factors = self._by_error_factors(parts), parts[0].error_factors
         self._common = SharedErrors(self._places(parts[0].state), window)
+        self.beyond_reference: BeyondReference | None = None
         self.forget_frames()
 
     def _by_error_factors(self, parts: Sequence[BoundPart]) -> Array | None:
@@ -243,7 +289,7 @@ class SystematicErrors:
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
-        covariance, by_reference = estimate.covariance.copy(), self._by_reference
+        covariance, by_reference, self.beyond_reference = estimate.covariance.copy(), self._by_reference, None
         stated = estimate.covariance
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
@@ -254,9 +300,12 @@ class SystematicErrors:
                 by_pose = frame.jacobian[:, :, d:] @ self._factors[d:]
                 by_reference = gain @ (frame.products(moved - by_pose) + past @ self._by_reference)
                 by_reference[d:] = self._factors[d:]
-            # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
-            if learns and not self._still:
-                self._learn_reference(frame, frame.left(moved, by_reference))
+            if learns:
+                left = frame.left(moved, by_reference)
+                self.beyond_reference = self._beyond_reference(frame, left, gain)
+                # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
+                if not self._still:
+                    self._learn_reference(frame, left)
             covariance += self._misfit.factor * by_reference @ by_reference.T
             stated = stated + by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)
@@ -272,6 +321,31 @@ class SystematicErrors:
         both = np.concatenate([frame.residuals[:, :, None], left], axis=2)
         shown, *expected = np.diag(self._common.in_common(both, self._common.n_pairs(frame.usable)))
         self._misfit.learn(float(shown), float(sum(expected)))
+
+    def _beyond_reference(self, frame: Linearization, left: Array, gain: Array) -> BeyondReference:
+        """What a frame shows that no error of the reference explains, errors of any size being fitted.
+
+        Parameters
+        ----------
+        frame : about its estimate, with residuals r = (I - J gain J' W) r0.
+        left : L (p, 2, c), what the errors leave of the motions of the pixels: they leave (I - L (L' W L)^-1 L' W) r.
+        gain : (n, n) of the estimate.
+        """
+        n, c = len(gain), left.shape[2]
+        both, rows = frame.with_unknowns(left), frame.residuals[:, :, None]
+        normal = both.products(left)[n:]
+        sizes = np.sqrt(np.diag(normal))
+        inverse = inverse_of_seen(normal, 1.0 / np.where(sizes > 0.0, sizes, 1.0))
+        taken = np.zeros((n + c, n + c))
+        taken[:n, :n], taken[n:, n:] = gain, inverse
+        taken[n:, :n] = -inverse @ both.products(frame.jacobian)[n:] @ gain
+        rest = rows - left @ (inverse @ both.products(rows)[n:])
+        n_pairs = self._common.n_pairs(frame.usable)
+        shown, common = np.diag(self._common.in_common(np.concatenate([rows, rest], axis=2), n_pairs))
+        noise = max(float(np.sum(rows**2)) / max(2 * int(frame.usable.sum()), 1) - max(float(shown), 0.0), FLOOR_PX**2)
+        gradients = self._common.gradients(both.weighted_jacobian)
+        share = self._common.share_left(frame.usable, both.jacobian, gradients, taken)
+        return BeyondReference(float(common), self._common.chance(noise, n_pairs), share, noise)
 
     def pushed(self, frame: Linearization, state: State) -> Array:
         """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters a frame's estimate."""
@@ -316,13 +390,14 @@ def _counting(jacobian, residuals, weights, huber):
     """What `Linearization` holds, of all points' Jacobian (p, 2, n), residuals (p, 2) and weights (p,)."""
     usable = np.zeros(len(weights), np.bool_)
     seen, left, weighted = np.zeros_like(jacobian), np.zeros_like(residuals), np.zeros_like(jacobian)
+    counted = np.zeros(len(weights))
     for j in range(len(weights)):
         length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
         if weights[j] > 0.0 and np.isfinite(length + np.sum(jacobian[j])):
             usable[j] = True
             weight = weights[j] * min(1.0, huber / max(length, 1e-300))
-            left[j], seen[j], weighted[j] = residuals[j], jacobian[j], weight * jacobian[j]
-    return usable, left, seen, weighted
+            left[j], seen[j], weighted[j], counted[j] = residuals[j], jacobian[j], weight * jacobian[j], weight
+    return usable, left, seen, weighted, counted
 
 
 @njit(cache=True, nogil=True)
