@@ -192,7 +192,7 @@ class SystematicErrors:
 
     Attributes
     ----------
-    beyond_reference : of the last frame; None where that does not tell.
+    beyond_reference : of the last frame; None where that does not tell, or the reference gets no blame.
     """
 
     def __init__(
@@ -300,12 +300,11 @@ class SystematicErrors:
                 by_pose = frame.jacobian[:, :, d:] @ self._factors[d:]
                 by_reference = gain @ (frame.products(moved - by_pose) + past @ self._by_reference)
                 by_reference[d:] = self._factors[d:]
-            if learns:
+            # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
+            if learns and not self._still:
                 left = frame.left(moved, by_reference)
                 self.beyond_reference = self._beyond_reference(frame, left, gain)
-                # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
-                if not self._still:
-                    self._learn_reference(frame, left)
+                self._learn_reference(frame, left)
             covariance += self._misfit.factor * by_reference @ by_reference.T
             stated = stated + by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)
