@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
+from scipy.special import betainc
 
 Array = NDArray[np.float64]
 #: Singular values and residuals below this share of the largest, or of all, are rounding.
@@ -62,5 +62,5 @@ def likeness(residuals: Array, slopes: Array) -> Likeness | None:
     variance = 2.0 * (squares - trace * mean) / (free * (free + 2.0))
     total = mean / 4.0 * (1.0 - mean / 4.0) / (variance / 16.0) - 1.0
     value = float(np.sum(np.diff(own) ** 2) / np.sum(own**2))
-    probability = float(beta.cdf(value / 4.0, total * mean / 4.0, total * (1.0 - mean / 4.0)))
+    probability = float(betainc(total * mean / 4.0, total * (1.0 - mean / 4.0), value / 4.0))
     return Likeness(value, probability, root_mean_square(own))
