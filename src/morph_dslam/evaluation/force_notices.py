@@ -102,7 +102,7 @@ class OtherFrameNumbers(ForceNotice):
     def of(cls, name: str, frames: Array, modelled: Array, places: Array, measured: Array) -> OtherFrameNumbers | None:
         """The notice that forces need, if they do; see `force_shift`."""
         found = force_shift(frames, modelled, places, measured)
-        return None if found is None else cls(name, found.shift, found.factor, found.rms, found.rms_as_given)
+        return None if found is None else cls(name, int(found.by), found.factor, found.rms, found.rms_as_given)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class OtherPlaceUnit(ForceNotice):
         found = place_scale(quantity, curve, places, modelled, ALIKE)
         if found is None:
             return None
-        return cls(curve.name, curve.against, found.scale, found.factor, found.rms, found.rms_as_given)
+        return cls(curve.name, curve.against, found.by, found.factor, found.rms, found.rms_as_given)
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def _some(frames: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _notes(mean_error: Callable[[int], float], of: str, unit: str) -> list[str]:
-    """What is said where ``mean_error`` is clearly less with so many more in each frame number."""
+    """A note where ``mean_error`` is clearly less with so many more in each frame number."""
 
     def error_with(shift: int) -> float:
         try:
@@ -92,23 +92,23 @@ def _notes(mean_error: Callable[[int], float], of: str, unit: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class ForceShift:
-    """Frame numbers of forces that are off.
+class Correction:
+    """What is wrong with where forces were measured: their frame numbers, or the unit of their places.
 
     Attributes
     ----------
-    shift : what each number lacks, one of `SHIFTS`.
-    factor : of the model's forces, with right numbers.
-    rms, rms_as_given : of what the factor and an offset leave with right numbers, and with those given.
+    by : what each number lacks, one of `SHIFTS`; or what the places have to be multiplied by.
+    factor : of the model's forces, once corrected.
+    rms, rms_as_given : of what the factor and an offset leave then, and as it was given.
     """
 
-    shift: int
+    by: float
     factor: float
     rms: float
     rms_as_given: float
 
 
-def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) -> ForceShift | None:
+def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) -> Correction | None:
     """Whether other frame numbers of measured forces explain what a factor and an offset leave.
 
     Parameters
@@ -133,7 +133,7 @@ def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) 
     (scale, late, _), _ = fit_columns(measured[rows], at[best], (at[best + 1] - at[best - 1]) / 2.0)
     if not abs(late) <= WHOLE * abs(scale):
         return None
-    return ForceShift(best, float(factor), rms, fits[0][1])
+    return Correction(best, float(factor), rms, fits[0][1])
 
 
 def fit_columns(measured: Array, *columns: Array) -> tuple[Array, float]:

@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.force_curves import ForceCurve
-from morph_dslam.evaluation.frame_numbers import CLEARLY, FEWEST_FORCES, fit_columns
+from morph_dslam.evaluation.frame_numbers import CLEARLY, FEWEST_FORCES, Correction, fit_columns
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class PlaceScale:
-    """Places of a curve that are off by a ratio of units.
-
-    Attributes
-    ----------
-    scale : what they have to be multiplied by.
-    factor : of the model's forces, with right places.
-    rms, rms_as_given : of what the factor and an offset leave with right places, and with those given.
-    """
-
-    scale: float
-    factor: float
-    rms: float
-    rms_as_given: float
-
-
-def place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array, alike: float) -> PlaceScale | None:
+def place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array, alike: float) -> Correction | None:
     """Whether a smaller unit of a curve's places explains a factor of its forces, and what that leaves.
 
     With it more of the curve is compared, which no noise and no other law makes straighter. A larger one is not tried:
@@ -56,5 +37,5 @@ def place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array
         (factor, _), rms = fit_columns(np.interp(places[inside], scale * known, forces), modelled[inside])
         is_size = 1.0 / alike <= factor <= alike and not 1.0 / alike <= given <= alike
         if is_size and before > CLEARLY * rms:
-            found.append(PlaceScale(scale, float(factor), rms, before))
+            found.append(Correction(scale, float(factor), rms, before))
     return min(found, key=lambda each: each.rms, default=None)

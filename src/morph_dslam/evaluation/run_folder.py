@@ -15,7 +15,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import EvaluationError, check_kind
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.run_states import FORMAT, VERSION
+from morph_dslam.io.run_states import RESULT, opened_result
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy, load_discrepancies
 from morph_dslam.model.unknown_loads import with_unknown_loads
@@ -142,35 +142,27 @@ def load_run(folder: str | Path) -> Run:
         If the copies of the model or of the camera file in it cannot be read.
     """
     folder = Path(folder)
-    path = folder / "result.h5"
+    path = folder / RESULT
     if not path.is_file():
-        raise EvaluationError(f"{folder} holds no result.h5: give a folder that `morph track -o` has written")
+        raise EvaluationError(f"{folder} holds no {RESULT}: give a folder that `morph track -o` has written")
     model, camera = load_model(folder / "model.morph"), load_camera(folder / "camera.yaml")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) != VERSION:  # type: ignore[arg-type]
-                raise EvaluationError(f"{path} is not a run of version {VERSION}: track again with this release")
-            names = np.atleast_1d(np.asarray(file["timings_ms"].attrs["names"], dtype=str)).tolist()
-            parameters = np.asarray(file["parameters"]).astype(float)
-            if parameters.shape[1] > len(model.parameters):
-                model = with_unknown_loads(model)
-            run = Run(
-                model=model,
-                camera=camera,
-                frames=np.asarray(file["frame"]).astype(np.int64),
-                status=_texts(file, "status"),
-                reasons=_texts(file, "reason"),
-                camera_from_object=np.asarray(file["camera_from_object"]).astype(float).reshape(-1, 4, 4),
-                parameters=parameters,
-                stage_times=dict(zip(names, np.asarray(file["timings_ms"]).T, strict=True)),
-                discrepancies=load_discrepancies(file),
-                covariances=np.asarray(file["covariance"]).astype(float) if "covariance" in file else None,
-            )
-    except EvaluationError:
-        raise
-    except Exception as error:
-        # h5py raises half a dozen types on damaged files, RuntimeError and KeyError among them.
-        raise EvaluationError(f"{path} is damaged or cut short: track again, or copy it again") from error
+    with opened_result(path, EvaluationError) as file:
+        names = np.atleast_1d(np.asarray(file["timings_ms"].attrs["names"], dtype=str)).tolist()
+        parameters = np.asarray(file["parameters"]).astype(float)
+        if parameters.shape[1] > len(model.parameters):
+            model = with_unknown_loads(model)
+        run = Run(
+            model=model,
+            camera=camera,
+            frames=np.asarray(file["frame"]).astype(np.int64),
+            status=_texts(file, "status"),
+            reasons=_texts(file, "reason"),
+            camera_from_object=np.asarray(file["camera_from_object"]).astype(float).reshape(-1, 4, 4),
+            parameters=parameters,
+            stage_times=dict(zip(names, np.asarray(file["timings_ms"]).T, strict=True)),
+            discrepancies=load_discrepancies(file),
+            covariances=np.asarray(file["covariance"]).astype(float) if "covariance" in file else None,
+        )
     if not len(run.frames):
         raise EvaluationError(f"{path} holds no frames: track again")
     return run

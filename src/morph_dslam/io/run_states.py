@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.errors import ExportError
+from morph_dslam.errors import ExportError, MorphError
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.reduced_model import SAME_PLACE
 from morph_dslam.model.unknown_loads import with_unknown_loads
@@ -95,6 +96,29 @@ def _are_alike(model: ReducedModel, other: ReducedModel) -> bool:
     return same and np.abs(model.nodes - other.nodes).max() <= SAME_PLACE * np.abs(model.nodes).max()
 
 
+@contextmanager
+def opened_result(path: Path, error_class: type[MorphError]) -> Iterator[h5py.File]:
+    """A run's ``result.h5``, to be read in the block.
+
+    Parameters
+    ----------
+    path : of the file.
+    error_class : what is raised if it is of another version, or damaged, which may show anywhere in the block.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) != VERSION:  # type: ignore[arg-type]
+                raise error_class(f"{path} is not a run of version {VERSION}: track again with this release")
+            yield file
+    except error_class:
+        raise
+    except Exception as error:
+        # h5py raises half a dozen types on damaged files, RuntimeError and KeyError among them.
+        raise error_class(
+            f"{path} is no result of a run, or damaged or cut short: track again, or copy it again"
+        ) from error
+
+
 def load_run_states(path: Path) -> RunStates:
     """Read the states from a run's ``result.h5``.
 
@@ -105,13 +129,7 @@ def load_run_states(path: Path) -> RunStates:
     """
     if not path.is_file():
         raise ExportError(f"there is no {path}: give a run folder of `morph track -o`, or a table of states")
-    try:
-        states = _read(path)
-    except ExportError:
-        raise
-    except Exception as error:
-        # h5py raises half a dozen types on damaged files, RuntimeError and KeyError among them.
-        raise ExportError(f"{path} is no result of a run, or damaged: track again, or copy it again") from error
+    states = _read(path)
     if not len(states.frames):
         raise ExportError(f"{path} has no state: the object was tracked in none of the frames")
     return states
@@ -120,9 +138,7 @@ def load_run_states(path: Path) -> RunStates:
 def _read(path: Path) -> RunStates:
     from morph_dslam.model.discrepancy import load_discrepancies  # SciPy takes long to load
 
-    with h5py.File(path, "r") as file:
-        if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) != VERSION:  # type: ignore[arg-type]
-            raise ExportError(f"{path} is not a run of version {VERSION}: track again with this release")
+    with opened_result(path, ExportError) as file:
         status, parameters = np.asarray(file["status"]), np.asarray(file["parameters"]).astype(float)
         rows = np.flatnonzero((status == b"tracked") & np.isfinite(parameters).all(axis=1))
         found = load_discrepancies(file)

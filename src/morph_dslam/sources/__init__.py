@@ -63,31 +63,23 @@ def open_stream(
         if matches(path):
             stream = open_kind(path, first, last)
             if fps is not None:
-                stream = _with_rate(stream, fps)
+                stream = _recorded(stream, "says the times of its frames itself: leave --fps out").with_rate(fps)
             if depth_per_metre is not None:
-                stream = _with_depth_per_metre(stream, depth_per_metre)
+                recorded = _recorded(stream, "has no depth images: leave --depth-per-metre out")
+                stream = recorded.with_depth_per_metre(depth_per_metre)
             return stream if open_kind in _BUILT_IN else _checked(stream, path)
     raise SourceError(
         f"there is no folder of images and no video at {path} (cameras are webcam:0, /dev/video0 or a URL)"
     )
 
 
-def _with_rate(stream: FrameStream, fps: float) -> FrameStream:
-    """The same frames, so many a second; SourceError if they have times of their own."""
+def _recorded(stream: FrameStream, refusal: str) -> RecordedFrames:
+    """A recording by this program's own readers; SourceError with the refusal if it is anything else."""
     if isinstance(stream, RecordedFrames):
-        return stream.with_rate(fps)
+        return stream
     if isinstance(stream, LiveStream):
         stream.close()
-    raise SourceError(f"{stream.name} says the times of its frames itself: leave --fps out")
-
-
-def _with_depth_per_metre(stream: FrameStream, values: float) -> FrameStream:
-    """The same frames, whose depth images have so many values a metre; SourceError if there are none."""
-    if isinstance(stream, RecordedFrames):
-        return stream.with_depth_per_metre(values)
-    if isinstance(stream, LiveStream):
-        stream.close()
-    raise SourceError(f"{stream.name} has no depth images: leave --depth-per-metre out")
+    raise SourceError(f"{stream.name} {refusal}")
 
 
 def _checked(stream: FrameStream, path: Path) -> FrameStream:

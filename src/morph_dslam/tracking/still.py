@@ -183,10 +183,8 @@ class StillProblem:
         """The scaled residuals of each keyframe; 0 for points of the reference view that met nothing."""
         n_met = int(met.sum())
         for number, recorded in enumerate(self._recorded):
-            frame, (of_pixels, of_depths) = (
-                _with_pixels(recorded, estimator.camera.undistort_pixels),
-                self._sigmas[number],
-            )
+            frame = _with_pixels(recorded, estimator.camera.undistort_pixels)
+            of_pixels, of_depths = self._sigmas[number]
             depths = None if frame.depths is None else frame.depths.take(met)
             found, left, weights, far = self._fitted(
                 estimator, frame.measured(points, met), depths, state, self._own[number]

@@ -41,7 +41,7 @@ FLOOR_PX = 0.05
 MEMORY = 600.0
 #: More than so many times the stated deviation of the reference is a warning.
 CLEARLY_WORSE = 2.0
-#: What is so many of its standard deviations from what is said of it refutes that. A right one is off by more in one
+#: A measurement so many standard deviations from a stated value refutes it. A right one is off by more in one
 #: frame of 15000 if errors are Gaussian; those of the registration are the same in all frames.
 REFUTED = 4.0
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
