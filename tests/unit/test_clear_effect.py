@@ -30,11 +30,11 @@ def seen_of(points, state, errors=0.0):
     return measured(points, CAMERA.project(points.in_camera(state)) + errors)
 
 
-def followed(seed):
+def followed(seed, loads=LOADS):
     """Errors and stated deviations (f,) of the side, half of the noise being the same in all frames."""
     points, rng, start, found = bound_points(MODEL, COUNT), np.random.default_rng(seed), State(MODEL.default, POSE), []
     filtered, stays = SequenceFilter(ESTIMATOR, [TURN]), rng.standard_normal((COUNT, 2))
-    for load in LOADS:
+    for load in loads:
         errors = np.sqrt(0.5) * SIGMA * (stays + rng.standard_normal((COUNT, 2)))
         seen = seen_of(points, State(np.array([load, SIDE]), POSE), errors)
         starts = [State(np.array([0.1, side]), POSE) for side in (-2.0, 0.0, 2.0)]
@@ -55,6 +55,19 @@ def test_the_side_of_what_is_not_bent_is_not_said_to_be_known():
     # As soon as it bends the side is told, and as well as stated.
     assert (found[:, 1][:, bent] < 0.2).all()
     assert 0.7 < np.sqrt(np.mean(off[:, bent] ** 2)) < 1.4
+
+
+def test_the_side_stays_known_when_what_was_bent_comes_back():
+    """Frames that tell nothing of the side were once taken for some that contradict it."""
+    there_and_back = np.concatenate([LOADS[9:], LOADS[:9:-1], np.zeros(20)])
+    found = np.array([followed(seed, there_and_back) for seed in range(12)])
+    errors, stated = found[:, 0], found[:, 1]
+    at_rest = there_and_back == 0.0
+    at_rest[0] = False
+    last_bent = np.flatnonzero(there_and_back)[-1]
+    # The past fades by a factor e in 600 frames; nothing else is lost.
+    assert (stated[:, at_rest] < 1.1 * stated[:, [last_bent]]).all()
+    assert 0.6 < np.sqrt(np.mean((errors[:, -1] / stated[:, -1]) ** 2)) < 1.4
 
 
 @pytest.mark.parametrize(("lengths", "absent"), [(3.5, True), (4.5, False)])

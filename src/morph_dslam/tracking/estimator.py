@@ -28,6 +28,11 @@ from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
 Array = NDArray[np.float64]
 
 
+#: What is known beforehand of an unknown that is hardly measured itself counts for this part of what is measured of the
+#: best one at least: well above `EIGENVALUE_FLOOR`.
+KNOWN_SHARE = 1e-6
+
+
 @dataclass(frozen=True)
 class LinearCost:
     """A cost about its minimum.
@@ -82,10 +87,13 @@ class LinearCost:
     def with_known(self, hessian: Array) -> LinearCost:
         """The same cost with what is known of the unknowns beforehand in its Hessian (n, n).
 
-        What is known far better than measured, as a pose that is held, does not make the rest seem to be seen.
+        What is known far better than measured, as a pose that is held, does not make the rest seem to be seen. What is
+        known but not measured at all is seen.
         """
-        measured, whole = np.diag(self.hessian), np.diag(hessian)
-        shares = np.where((measured > 0.0) & (whole > measured), measured / np.where(whole > 0.0, whole, 1.0), 1.0)
+        squared = self.scale**2
+        measured, whole = np.diag(self.hessian) * squared, np.diag(hessian) * squared
+        counts = np.maximum(measured, np.minimum(whole, measured.max(initial=0.0) * KNOWN_SHARE))
+        shares = np.where((counts > 0.0) & (whole > counts), counts / np.where(whole > 0.0, whole, 1.0), 1.0)
         return replace(self, hessian=hessian, scale=self.scale * np.sqrt(shares))
 
     @staticmethod

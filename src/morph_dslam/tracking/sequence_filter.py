@@ -276,7 +276,7 @@ class SequenceFilter(Generic[Frame]):
         self.keeps = not conflict
         if conflict and (self._walks or not self._is_far_surer(self._past, by_itself)):
             return by_itself
-        past = self._prior(self._past, measured, errors)
+        past = self._prior(self._past, measured, errors, linear)
         self.past_information[:-6, :-6] = past.information
         prior = past if known is None else past.joined(known)
         fused = self._estimator.fit(measured, self._start(by_itself), prior)
@@ -372,25 +372,33 @@ class SequenceFilter(Generic[Frame]):
         parameters[self._kept[surer]] = self._past.mean[surer]
         return replace(alone.state, parameters=parameters)
 
-    def _prior(self, past: _Past, measured: Frame, errors: _Errors) -> Prior:
+    def _prior(self, past: _Past, measured: Frame, errors: _Errors, linear: LinearCost) -> Prior:
         """The past as a term of the frame's cost, of the weight that makes the variance of both least.
 
         In the basis in which the frame's covariance is 1 and the past's p, with the covariance c of both, the
-        weight of the past is (1 - c) / (1 + p - 2 c).
+        weight of the past is (1 - c) / (1 + p - 2 c). Of what has no effect in the frame the past is held.
         """
         d, own = self._unknowns - 6, self._of_kept(errors.covariance)
-        squared_px = np.trace(np.linalg.solve(self._of_kept(errors.inverse), own)) / len(self._kept)
         p, basis = scipy.linalg.eigh(past.covariance, own)
         shared = quadratic(past.by_point, measured.correlation, errors.by_point[:, :, self._kept])
         error_factors = min(len(past.by_factor), len(errors.by_factor))
         shared += past.by_factor[:error_factors].T @ errors.by_factor[:error_factors, self._kept]
         c = np.einsum("ik,ij,jk->k", basis, shared, basis)
         weight = np.clip((1.0 - c) / np.maximum(1.0 + p - 2.0 * c, 1e-12), 0.0, LARGEST_WEIGHT)
+        squared_px = 1.0 / np.einsum("ik,ij,jk->k", basis, self._of_kept(errors.inverse), basis)
         root = basis * np.sqrt(squared_px * weight / (1.0 - weight))
         mean, information = np.zeros(d), np.zeros((d, d))
         mean[self._kept] = past.mean
         information[np.ix_(self._kept, self._kept)] = root @ root.T
+        information[np.ix_(self._constant, self._constant)] += self._held_where_without_effect(linear)
         return Prior(mean, information)
+
+    def _held_where_without_effect(self, linear: LinearCost) -> Array:
+        """Information (k, k) on shared parameters that leaves what is unobservable in a frame as it was."""
+        model = self._estimator.model
+        ranges = (model.upper - model.lower)[self._constant]
+        directions = np.sqrt(12.0) * self._unobservable / ranges
+        return np.max(np.diag(linear.hessian) * linear.scale**2) * directions / np.outer(ranges, ranges)
 
     def _contradicts(self, past: _Past, estimate: Estimate) -> bool:
         """Whether a frame by itself says something else than all those before."""
