@@ -192,7 +192,7 @@ def sensitivity_errors(model: ReducedModel) -> Array:
 
 #: The weight of the past in the mean of past and frame stays below this.
 LARGEST_WEIGHT = 0.999
-#: Frames over which the past fades, by a factor e.
+#: Frames over which the past fades, by a factor e. Of what a frame does not show it does not.
 MEMORY = 600.0
 #: A frame whose own estimate is so many standard deviations off the past's changes nothing of it; it stands
 #: by itself, unless the past is far surer of what does not change. After so many in a row the past is forgotten.
@@ -238,6 +238,7 @@ class SequenceFilter(Generic[Frame]):
         self._step = np.diag([0.0] * len(indices) + [step**2 for step in walking.values()])
         self._walks = bool(walking)
         self._unknowns = len(estimator.model.parameters) + 6
+        self._ranges = (estimator.model.upper - estimator.model.lower)[self._constant]
         self._noise = PixelNoise(MEMORY)
         self._past: _Past | None = None
         self._unobservable = np.zeros((len(self._constant),) * 2)
@@ -299,8 +300,7 @@ class SequenceFilter(Generic[Frame]):
         self._unobservable = np.zeros((len(constant),) * 2)
         if not 0 < len(constant) < d:
             return self._unobservable
-        ranges = (model.upper - model.lower)[constant]
-        variances, axes = np.ones(1), np.eye(1)
+        ranges, variances, axes = self._ranges, np.ones(1), np.eye(1)
         if len(constant) > 1:  # directions, the best known first
             own = self._errors(measured, linear, alone.state, known).covariance[np.ix_(constant, constant)]
             variances, axes = np.linalg.eigh(own / np.outer(ranges, ranges))
@@ -352,17 +352,24 @@ class SequenceFilter(Generic[Frame]):
 
     def _keep(self, estimate: Estimate, errors: _Errors) -> None:
         """Make the estimate's parameters that are one per sequence the past of the next frame."""
-        grown = np.exp(1.0 / MEMORY)
+        fades, k = self._fading(), self._kept
         self._past = _Past(
-            estimate.state.parameters[self._kept],
-            grown * self._of_kept(errors.covariance) + self._step,
-            np.sqrt(grown) * errors.by_point[:, :, self._kept],
-            grown * self._of_kept(errors.by_frames) + self._step,
-            np.sqrt(grown) * errors.by_factor[:, self._kept],
-            grown * self._of_kept(errors.unseen),
-            {view: np.sqrt(grown) * rows[:, self._kept] for view, rows in errors.by_views.items()},
+            estimate.state.parameters[k],
+            fades @ self._of_kept(errors.covariance) @ fades.T + self._step,
+            errors.by_point[:, :, k] @ fades.T,
+            fades @ self._of_kept(errors.by_frames) @ fades.T + self._step,
+            errors.by_factor[:, k] @ fades.T,
+            fades @ self._of_kept(errors.unseen) @ fades.T,
+            {view: rows[:, k] @ fades.T for view, rows in errors.by_views.items()},
             {} if self._past is None else self._past.left,
         )
+
+    def _fading(self) -> Array:
+        """By which errors of the kept parameters (k, k) grow from one frame to the next; what a frame shows fades."""
+        growth = np.exp(0.5 / MEMORY)
+        fades, n = growth * np.eye(len(self._kept)), len(self._constant)
+        fades[:n, :n] -= (growth - 1.0) * self._without_effect_in_ranges() * np.divide.outer(self._ranges, self._ranges)
+        return fades
 
     def _start(self, alone: Estimate) -> State:
         """Where to look for the fused state: the frame's, with what the past is surer of."""
@@ -395,10 +402,12 @@ class SequenceFilter(Generic[Frame]):
 
     def _held_where_without_effect(self, linear: LinearCost) -> Array:
         """Information (k, k) on shared parameters that leaves what is unobservable in a frame as it was."""
-        model = self._estimator.model
-        ranges = (model.upper - model.lower)[self._constant]
-        directions = np.sqrt(12.0) * self._unobservable / ranges
-        return np.max(np.diag(linear.hessian) * linear.scale**2) * directions / np.outer(ranges, ranges)
+        most = np.max(np.diag(linear.hessian) * linear.scale**2)
+        return most * self._without_effect_in_ranges() / np.outer(self._ranges, self._ranges)
+
+    def _without_effect_in_ranges(self) -> Array:
+        """Projection (k, k) of shared parameters, as parts of their ranges, to what is unobservable in a frame."""
+        return np.sqrt(12.0) * self._unobservable / self._ranges
 
     def _contradicts(self, past: _Past, estimate: Estimate) -> bool:
         """Whether a frame by itself says something else than all those before."""
