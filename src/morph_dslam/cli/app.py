@@ -92,8 +92,14 @@ def run_and_report_errors(
     return 0
 
 
+#: How often a progress bar is written into a file or a pipe, seconds. tqdm reads the variable when it is loaded.
+LOGGED_EVERY = ("TQDM_MININTERVAL", "10")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status of `run_and_report_errors`."""
+    if not sys.stderr.isatty():
+        os.environ.setdefault(*LOGGED_EVERY)
     given = sys.argv[1:] if arguments is None else arguments
     parsed = new_parser().parse_args(with_signed_sections(given))
     parsed.words = list(given)

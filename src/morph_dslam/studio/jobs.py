@@ -108,7 +108,8 @@ class Jobs:
         self._process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "morph_dslam", *words,
             cwd=self._folder, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, start_new_session=True,
+            stderr=asyncio.subprocess.STDOUT, start_new_session=True,
+            env=os.environ | {"PYTHONUNBUFFERED": "1", "TQDM_MININTERVAL": "0.1"},
         )  # fmt: skip
         self._task = asyncio.create_task(self._follow(self.job, self._process))
         self._changed()
