@@ -264,5 +264,7 @@ def test_progress_in_a_log_is_a_line_in_ten_seconds():
     code = "from morph_dslam.cli import main; main(['info', 'absent.morph']); import tqdm; print(tqdm.tqdm([]).mininterval)"
     known = {name: value for name, value in os.environ.items() if not name.startswith("TQDM_")}
     for given, interval in (({}, 10.0), ({"TQDM_MININTERVAL": "3"}, 3.0)):
-        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=known | given, check=True)
+        run = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env=known | given, check=True
+        )
         assert float(run.stdout) == interval

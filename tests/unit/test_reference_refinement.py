@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.tracking.binding import nearest_surface_points
@@ -35,7 +35,7 @@ def test_other_frames_correct_a_reference_that_bad_landmarks_spoiled():
     landmarks = BoundPoints.from_surface(model, nearest_surface_points(model.nodes, model.triangles, object_points)[0])
     clicked = CAMERA.project(landmarks.in_camera(truth)) + 1.5 * rng.standard_normal((10, 2))
     registered = register_landmarks(model, CAMERA, Landmarks(object_points, clicked)).state
-    refined = refine_reference(
+    refined, _ = refine_reference(
         Estimator(model, CAMERA),
         LandmarkTerm(landmarks, clicked, 1.5),
         CAMERA.project(points.in_camera(truth)),
@@ -57,8 +57,28 @@ def test_a_right_reference_is_left_where_it_is():
     points = bound_points(model, 80, rng)
     keyframes = [keyframe(points, sheet_state(time), rng, noise=0.0) for time in (0.2, 0.5)]
     pixels = CAMERA.project(points.in_camera(truth))
-    refined = refine_reference(Estimator(model, CAMERA), LandmarkTerm(points, pixels, 0.5), pixels, truth, keyframes)
+    refined, _ = refine_reference(Estimator(model, CAMERA), LandmarkTerm(points, pixels, 0.5), pixels, truth, keyframes)
     assert mean_error(model, refined, truth) < 1e-5
+
+
+def test_a_refined_reference_is_off_by_what_is_stated():
+    """Landmarks a pixel off, and points that were read off the reference view by 0.4 px wrongly, alike in all frames."""
+    model, truth, off = bent_sheet_model(22, 16), sheet_state(0.0), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        points = bound_points(model, 120, rng)
+        keyframes = [keyframe(points, sheet_state(time), rng, noise=0.1) for time in np.linspace(0.1, 0.9, 5)]
+        marked = bound_points(model, 8, rng)
+        clicked = CAMERA.project(marked.in_camera(truth)) + rng.standard_normal((8, 2))
+        pixels = CAMERA.project(points.in_camera(truth)) + 0.4 * rng.standard_normal((120, 2))
+        estimator = Estimator(model, CAMERA)
+        refined, covariance = refine_reference(estimator, LandmarkTerm(marked, clicked, 1.0), pixels, truth, keyframes)
+        pose, true = refined.camera_from_object, truth.camera_from_object
+        errors = [*(refined.parameters - truth.parameters), *rotation_log(pose.rotation @ true.rotation.T)]
+        errors += [*(pose.translation - true.translation)]
+        off.append(errors / np.sqrt(np.diag(covariance)))
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5
+    assert np.mean(np.abs(off) < 2.6) > 0.95
 
 
 def test_keyframes_are_spread_over_the_sequence():

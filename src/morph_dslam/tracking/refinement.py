@@ -23,8 +23,8 @@ from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
-#: Step of scaled unknowns that derivatives are differences over.
-DIFFERENCE = 1e-2
+#: Step of scaled unknowns that derivatives are differences over, on the way to a minimum and for its covariance.
+DIFFERENCE, WIDE = 1e-2, 0.3
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def refine_reference(
     reference_pixels: Array,
     start: State,
     keyframes: Sequence[Keyframe],
-) -> State:
+) -> tuple[State, Array]:
     """The reference state that explains the registration and the keyframes best, in which no unknown loads act.
 
     Parameters
@@ -108,6 +108,11 @@ def refine_reference(
     reference_pixels : (p, 2) of the followed points in the reference view.
     start : the registered state.
     keyframes : where these points were seen in other frames.
+
+    Returns
+    -------
+    state : parameters and pose.
+    covariance : (d + 6, d + 6) of it.
     """
     model, camera = estimator.model, estimator.camera
     inner = Estimator(model, camera, replace(estimator.options, max_iterations=8, tolerance=1e-5))
@@ -140,7 +145,51 @@ def refine_reference(
         return result
 
     found = minimum(lambda step: residuals(whole(step)), np.zeros(len(free)), (bounds[0, free], bounds[1, free]), 10)
-    return reference(whole(found.x))
+    n_known, n_points = len(known.residuals(camera, start)), len(reference_pixels)
+    jacobian = _without_points_that_come_and_go(lambda step: residuals(whole(step)), found, n_known)
+    rows = np.split(jacobian[n_known:], np.cumsum(_sizes(keyframes, n_points))[:-1]) if keyframes else []
+    covariance = np.zeros((d + 6, d + 6))
+    covariance[np.ix_(free, free)] = _covariance(jacobian[:n_known], rows, 2 * n_points)
+    return reference(whole(found.x)), covariance * np.outer(scale, scale)
+
+
+def _without_points_that_come_and_go(residuals: Callable[[Array], Array], found: OptimizeResult, n_known: int) -> Array:
+    """Derivatives (r, k) at the minimum, zero of points that do not meet the surface a step beside it.
+
+    The residual of such a point is zero: its jump over a short step is no derivative.
+
+    Parameters
+    ----------
+    n_known : the first residuals, which are of no such points.
+    """
+    steps = WIDE * np.eye(len(found.x))
+    ahead, behind = (np.array([residuals(found.x + sign * step) for step in steps]) for sign in (1.0, -1.0))
+    met = (ahead != 0.0).all(axis=0) & (behind != 0.0).all(axis=0)
+    met[:n_known] = True
+    return np.asarray(np.where(met, (ahead - behind) / (2.0 * WIDE), 0.0).T)
+
+
+def _sizes(keyframes: Sequence[Keyframe], n_points: int) -> list[int]:
+    """How many residuals each keyframe has, those of the points first."""
+    return [2 * (n_points + (0 if frame.outline is None else len(frame.outline.pixels))) for frame in keyframes]
+
+
+def _covariance(known: Array, keyframes: Sequence[Array], n_points: int) -> Array:
+    """That of the minimum (k, k) by derivatives of the residuals by its k unknowns.
+
+    A point errs alike in all keyframes: its place was read off the reference view once, and the model is off in the
+    same way. So many keyframes do not average that out.
+
+    Parameters
+    ----------
+    known : (n, k) of what the registration rests on.
+    keyframes : (m, k) of each, those of ``n_points`` numbers of the reference view first.
+    """
+    lasting = np.sum([rows[:n_points] for rows in keyframes], axis=0) if keyframes else known[:0]
+    independent = [known, *(rows[n_points:] for rows in keyframes)]
+    spread = lasting.T @ lasting + np.sum([rows.T @ rows for rows in independent], axis=0)
+    inverse = np.linalg.pinv(known.T @ known + np.sum([rows.T @ rows for rows in keyframes], axis=0))
+    return np.asarray(inverse @ spread @ inverse)
 
 
 def minimum(

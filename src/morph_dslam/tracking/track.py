@@ -447,7 +447,7 @@ def _views_of(placed: Sequence[PlacedObject], run: TrackOptions) -> list[Augment
 
 
 def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -> PlacedObject:
-    """An object with its reference state refined over the sequence; how well a moving one is known is not known."""
+    """An object with its reference state refined over the sequence."""
     if part.options.pose == "still":
         return with_still_pose(part, keyframes, run.refine_camera)
     landmarks, registration = part.object.start, part.registration
@@ -457,15 +457,15 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
     assert isinstance(tracker, Tracker)
     pixels, chosen = tracker.reference.pixels, choose_keyframes(keyframes)
     if not part.options.use_discrepancy:
-        state = refine_reference(tracker.estimator, known_state(part), pixels, registration.state, chosen)
-        refined = replace(registration, state=state, covariance=None)
+        state, covariance = refine_reference(tracker.estimator, known_state(part), pixels, registration.state, chosen)
+        refined = replace(registration, state=state, covariance=covariance)
     else:
         # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
         bound, seen = bind_landmarks(part.model, landmarks.points), part.camera.undistort_pixels(landmarks.pixels)
         known = Reference(registration.state, pixels, bound, seen, landmark_deviation(registration.facts["sigma_px"]))
         fit = DiscrepancyFit(part.model, part.camera, part.options.discrepancy)
         found = refine_discrepancy(fit, tracker.estimator, known, chosen)
-        refined = replace(registration, discrepancy=found, covariance=None)
+        refined = replace(registration, discrepancy=found)
     return replace(part, registration=refined)
 
 
