@@ -351,6 +351,23 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Rectification:
+    """How the images of a stereo pair are turned until their rows coincide.
+
+    Attributes
+    ----------
+    camera : the ideal pinhole of both rectified images
+    rectified_from_left : (3, 3) rotation of the left camera's axes
+    left_maps, right_maps : for `cv2.remap`, from the left and the right image
+    """
+
+    camera: Camera
+    rectified_from_left: Array
+    left_maps: Maps
+    right_maps: Maps
+
+
+@dataclass(frozen=True)
 class StereoCamera:
     """Two cameras and the pose of the left one in the right one's frame, metres."""
 
@@ -363,12 +380,8 @@ class StereoCamera:
         """Distance between the centres of the cameras, metres."""
         return float(np.linalg.norm(self.right_from_left.translation))
 
-    def rectify(self) -> tuple[Camera, Maps, Maps]:
+    def rectify(self) -> Rectification:
         """Turn both cameras until their rows coincide, by the smallest turns (Fusiello et al. 2000).
-
-        Returns
-        -------
-        The ideal pinhole of both rectified images, and the maps for `cv2.remap` from the left and the right image.
 
         Raises CameraError if the cameras differ in image size, stand in one place, or the right one is not to the
         right.
@@ -384,7 +397,8 @@ class StereoCamera:
         centre = 0.5 * (left.intrinsics[2:] + right.intrinsics[2:])
         camera = Camera(left.width, left.height, focal, focal, float(centre[0]), float(centre[1]))
         left_rays = camera.pixel_rays @ rotation
-        return camera, left.maps_of(left_rays), right.maps_of(left_rays @ self.right_from_left.rotation.T)
+        right_rays = left_rays @ self.right_from_left.rotation.T
+        return Rectification(camera, rotation, left.maps_of(left_rays), right.maps_of(right_rays))
 
     def _rectified_from_left(self) -> Array:
         """The rotation whose x axis points to the right camera and whose z axis is between both cameras'."""

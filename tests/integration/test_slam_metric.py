@@ -10,7 +10,7 @@ from morph_dslam.camera import StereoCamera
 from morph_dslam.cli.app import main
 from morph_dslam.errors import CameraError, MapError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.camera_files import save_camera
+from morph_dslam.io.camera_files import load_camera, save_camera
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import NoPose, SlamReason, SlamStatus
@@ -20,8 +20,9 @@ from morph_dslam.slam.slam import Slam
 from tests.support.rendered_room import CAMERA, Film, RoomFilm, follow, hand_held, off_the_walls, pose
 
 BASELINE = 0.11
-PAIR = StereoCamera(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-BASELINE, 0.0, 0.0])))
-TO_RIGHT = pose((BASELINE, 0.0, 0.0))
+#: The right camera stands to the right and is toed in by 0.07 rad: rectified images are turned against the left ones.
+TO_RIGHT = pose((BASELINE, 0.0, 0.004), (0.0, -0.07, 0.0))
+PAIR = StereoCamera(CAMERA, CAMERA, RigidTransform.from_matrix(TO_RIGHT).inverse)
 
 
 def recording(kind, path):
@@ -49,7 +50,7 @@ def test_path_and_map_are_metric_from_the_first_frame_on(kind, request):
     scene = map_scene(film, PAIR if kind == "stereo" else CAMERA)
     assert {frame.status for frame in scene.frames} == {SlamStatus.TRACKED}
     assert scene.is_metric
-    # The first camera is the world's origin in both: nothing is aligned, and the scale is the estimate's own.
+    # The first camera is the world's origin in both: nothing is aligned, and scale and axes are the estimate's own.
     errors = np.linalg.norm(scene.trajectory.positions - truth[:, :3, 3], axis=1)
     length = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
     assert np.median(errors) < 0.005 * length
@@ -170,7 +171,7 @@ def write_tum(folder, film):
 
 
 def write_euroc(folder, film):
-    for name, place in (("cam0", 0.0), ("cam1", BASELINE)):
+    for name, place in (("cam0", np.eye(4)), ("cam1", TO_RIGHT)):
         camera = folder / "mav0" / name
         (camera / "data").mkdir(parents=True)
         rows = []
@@ -180,7 +181,7 @@ def write_euroc(folder, film):
             rows.append(f"{stamp},{stamp}.png")
         (camera / "data.csv").write_text("#timestamp [ns],filename\n" + "\n".join(rows) + "\n")
         (camera / "sensor.yaml").write_text(
-            f"T_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, {place}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+            f"T_BS:\n  cols: 4\n  rows: 4\n  data: {place.ravel().tolist()}\n"
             "resolution: [640, 480]\ncamera_model: pinhole\n"
             f"intrinsics: [{CAMERA.fx}, {CAMERA.fy}, {CAMERA.cx}, {CAMERA.cy}]\n"
             "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
@@ -202,7 +203,8 @@ def test_the_command_reads_recordings_with_depth_and_stereo_pairs(tmp_path, kind
     # The saved map is metric too, and serves a camera alone.
     assert main([*command, str(tmp_path / "again"), "--map", str(run / "map.h5"), "--no-depth"]) == 0
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["n_tracked"] == 15
-    assert load_scene(tmp_path / "again" / "map.h5", Slam(PAIR).camera if kind == "stereo" else CAMERA).is_metric
+    # What was given as the camera is that of the map for all other commands too.
+    assert load_scene(tmp_path / "again" / "map.h5", load_camera(camera)).is_metric
 
 
 def test_the_unit_of_depth_images_is_given(tmp_path, with_depth, capsys, refused):

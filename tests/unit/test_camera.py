@@ -187,10 +187,11 @@ def centre(image):
 
 @pytest.mark.parametrize("point", [[0.05, 0.0, 1.0], [-0.2, 0.15, 0.8], [0.5, -0.4, 2.0]])
 def test_rectified_images_share_rows_and_disparity_gives_the_point(point):
-    camera, left_maps, right_maps = PAIR.rectify()
+    rectified = PAIR.rectify()
+    camera = rectified.camera
     right_point = PAIR.right_from_left.apply(np.array(point))
-    left = centre(cv2.remap(dot_image(LEFT, np.array(point)), *left_maps, cv2.INTER_LINEAR))
-    right = centre(cv2.remap(dot_image(RIGHT, right_point), *right_maps, cv2.INTER_LINEAR))
+    left = centre(cv2.remap(dot_image(LEFT, np.array(point)), *rectified.left_maps, cv2.INTER_LINEAR))
+    right = centre(cv2.remap(dot_image(RIGHT, right_point), *rectified.right_maps, cv2.INTER_LINEAR))
     assert right[1] == pytest.approx(left[1], abs=0.1)
     # The rectified frame is the left one turned: distances from both centres stay.
     found = camera.rays(left[None])[0] * camera.fx * PAIR.baseline / (left[0] - right[0])

@@ -302,7 +302,7 @@ def test_colmap_cameras_that_are_refused(tmp_path, text, message):
 def test_missing_binary_and_folder_are_refused(tmp_path):
     with pytest.raises(CameraError, match=r"cannot read the camera file .*absent\.yaml"):
         load_camera(tmp_path / "absent.yaml")
-    with pytest.raises(CameraError, match="cannot read"):
+    with pytest.raises(CameraError, match=r"is a folder.*give a camera file"):
         load_camera(tmp_path)
     (tmp_path / "image.yaml").write_bytes(bytes(range(128, 256)))
     with pytest.raises(CameraError, match="not a text file"):
@@ -370,6 +370,11 @@ def test_euroc_gives_both_poses_in_the_body(tmp_path):
         pair = load_camera_or_pair(given)
         assert (pair.left, pair.right) == (LEFT, RIGHT)
         np.testing.assert_allclose(pair.right_from_left.matrix, RIGHT_IN_LEFT.inverse.matrix, atol=1e-12)
+        # Where one camera is needed, as that of the pair's map, it is the left one.
+        assert load_camera(given) == LEFT
+    for load in (load_camera, load_camera_or_pair):
+        with pytest.raises(CameraError, match=r"is a folder.*cam0/sensor.yaml: give a camera file"):
+            load(tmp_path / "mav0" / "cam1")
     (tmp_path / "mav0" / "cam1" / "sensor.yaml").unlink()
     with pytest.raises(CameraError, match=r"cannot read the camera file .*cam1"):
         load_camera_or_pair(tmp_path)

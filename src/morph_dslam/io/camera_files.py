@@ -71,11 +71,14 @@ def load_camera(path: str | Path) -> Camera:
 
     Parameters
     ----------
-    path : the file; in one with several cameras, `file#name` chooses: `camchain.yaml#cam1`, `cameras.txt#2`
+    path : the file; in one with several cameras, `file#name` chooses: `camchain.yaml#cam1`, `cameras.txt#2`. A folder
+        in EuRoC's layout is its left camera, cam0, which maps of the pair are of
 
     Raises CameraError if the file is missing or malformed, lacks or misnames a value, has a camera or distortion model
     that is not known, does not say its image size, or holds several cameras of which none is chosen.
     """
+    if Path(path).is_dir():
+        path = _euroc_base(Path(path)) / "cam0" / "sensor.yaml"
     path, name = _split_name(Path(path))
     where = str(path) if name is None else f"{path}#{name}"
     if path.suffix == ".txt":
@@ -111,6 +114,15 @@ def load_camera_or_pair(path: str | Path) -> Camera | StereoCamera:
             (left, _), (right, right_from_left) = _cameras_of_kalibr(path, content, 2)
             return StereoCamera(left, right, right_from_left)
     return load_camera(path)
+
+
+def load_body_from_sensor(path: Path) -> RigidTransform:
+    """Where a sensor of a EuRoC recording stands: T_BS of its `sensor.yaml`, metres.
+
+    Raises CameraError if the file is missing or malformed, or does not say it.
+    """
+    content = _read_yaml(path)
+    return _transform(content.get("T_BS") if isinstance(content, dict) else None, f"{path}: T_BS")
 
 
 def load_rig(path: str | Path) -> list[tuple[Camera, RigidTransform]]:
@@ -227,8 +239,21 @@ def _cameras_of_kalibr(path: Path, chain: Mapping, count: int) -> list[tuple[Cam
     return cameras
 
 
-def _pair_of_euroc(folder: Path) -> StereoCamera:
+def _euroc_base(folder: Path) -> Path:
+    """The folder in EuRoC's layout that holds those of the sensors: ``folder``, or `mav0` in it.
+
+    Raises CameraError if there is no cam0 in it.
+    """
     base = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    if not (base / "cam0").is_dir():
+        raise CameraError(
+            f"{folder} is a folder, and not in EuRoC's layout, whose camera is in cam0/sensor.yaml: give a camera file"
+        )
+    return base
+
+
+def _pair_of_euroc(folder: Path) -> StereoCamera:
+    base = _euroc_base(folder)
     cameras, poses = [], []
     for name in ("cam0", "cam1"):
         file = base / name / "sensor.yaml"
@@ -236,7 +261,7 @@ def _pair_of_euroc(folder: Path) -> StereoCamera:
         if not isinstance(content, dict):
             raise CameraError(f"{file} holds no camera")
         cameras.append(parse_camera(_from_kalibr(content, str(file)), str(file)))
-        poses.append(_transform(content.get("T_BS"), f"{file}: T_BS"))
+        poses.append(load_body_from_sensor(file))
     return StereoCamera(cameras[0], cameras[1], poses[1].inverse @ poses[0])
 
 

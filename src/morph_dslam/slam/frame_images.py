@@ -17,7 +17,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera, StereoCamera
+from morph_dslam.camera import Camera, Rectification, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.slam.options import LEAST_CORRELATION, PATCH_HALF
 from morph_dslam.slam.pose import inside
@@ -245,6 +245,52 @@ class StereoImages:
         return np.empty((0, 3), dtype=np.float32)
 
 
+@dataclass(frozen=True)
+class StereoDepth:
+    """Depth at pixels of the undistorted left image, by both rectified images of a stereo pair.
+
+    Right columns are those of a camera that stands beside the left one as the right one does, with its axes and its
+    lens: map and poses are then of the left camera as users know it, and the rectified one stays in here.
+
+    Attributes
+    ----------
+    left : the left camera
+    rectification : of the pair
+    images : both images, rectified
+    baseline_px : focal length of the left camera times the baseline, px m
+    """
+
+    left: Camera
+    rectification: Rectification
+    images: StereoImages
+    baseline_px: float
+
+    def right_columns(self, pixels: Array, expected: Array | None = None) -> Array:
+        """As `FrameDepth` says."""
+        turned, per_disparity = self._rectified(pixels)
+        if expected is not None:
+            expected = turned[:, 0] - (pixels[:, 0] - expected) / per_disparity
+        return pixels[:, 0] - per_disparity * (turned[:, 0] - self.images.right_columns(turned, expected))
+
+    def at(self, pixels: Array) -> Array:
+        """As `FrameDepth` says."""
+        return depth_of(pixels, self.right_columns(pixels), self.baseline_px)
+
+    def samples(self) -> NDArray[np.float32]:
+        """As `FrameDepth` says: those of the rectified images."""
+        return self.images.samples()
+
+    def _rectified(self, pixels: Array) -> tuple[Array, Array]:
+        """Rectified pixels (n, 2), and disparities (n,) of the left camera for one pixel of theirs.
+
+        A depth is that of the rectified camera times the ray's depth in the left one, and goes by one over disparity.
+        """
+        rays = self.left.rays(pixels) @ self.rectification.rectified_from_left.T
+        # Rays behind the rectified camera have no pixel there: any outside of the image gives no depth.
+        turned = np.nan_to_num(self.rectification.camera.project(rays), nan=-1.0)
+        return turned, self.baseline_px / self.images.baseline_px * rays[:, 2]
+
+
 def _near(columns: Array, expected: Array | None) -> Array:
     if expected is None:
         return columns
@@ -311,7 +357,7 @@ class FrameImages:
 
     Attributes
     ----------
-    camera : of the undistorted images.
+    camera : of the undistorted images, the left ones of a stereo pair.
     baseline_px : of the depth (`RigidMap`), 0 without depth.
 
     Raises CameraError if a stereo pair is to have depth images too, or cannot be rectified.
@@ -321,16 +367,17 @@ class FrameImages:
         if isinstance(camera, StereoCamera):
             if with_depth:
                 raise CameraError("a stereo pair measures depth itself: give one camera for depth images")
-            self.camera, self._maps, self._right_maps = camera.rectify()
-            self.baseline_px = self.camera.fx * camera.baseline
+            self.camera, self._rectification, baseline = camera.left, camera.rectify(), camera.baseline
         else:
-            self.camera, self._maps, self._right_maps = camera, camera.undistortion_maps(), None
-            self.baseline_px = camera.fx * VIRTUAL_BASELINE if with_depth else 0.0
+            self.camera, self._rectification = camera, None
+            baseline = VIRTUAL_BASELINE if with_depth else 0.0
+        self._maps = self.camera.undistortion_maps()
+        self.baseline_px = self.camera.fx * baseline
 
     @property
     def is_stereo(self) -> bool:
-        """Whether frames come in rectified pairs."""
-        return self._right_maps is not None
+        """Whether frames come in pairs."""
+        return self._rectification is not None
 
     def undistort(self, image: Image) -> Image:
         """The image (h, w[, 3]) as ``camera`` would have seen it."""
@@ -350,18 +397,21 @@ class FrameImages:
         """
         grey = self._grey(image, f"frame {index}", self._maps)
         normalized = normalize_contrast(grey)
-        return FrameView(index, timestamp, grey, normalized, self._depth(index, normalized, depth, right))
+        return FrameView(index, timestamp, grey, normalized, self._depth(index, image, depth, right))
 
     def _depth(
-        self, index: int, normalized: Image, depth: NDArray[np.float32] | None, right: Image | None
+        self, index: int, image: Image, depth: NDArray[np.float32] | None, right: Image | None
     ) -> FrameDepth | None:
         if not self.baseline_px:
             return None
-        if self._right_maps is not None:
+        if self._rectification is not None:
             if right is None:
                 return None
-            right = self._grey(right, f"the right image of frame {index}", self._right_maps)
-            return StereoImages(normalized, normalize_contrast(right), self.baseline_px)
+            found = self._rectification
+            left = normalize_contrast(self._grey(image, f"frame {index}", found.left_maps))
+            right = normalize_contrast(self._grey(right, f"the right image of frame {index}", found.right_maps))
+            baseline_px = self.baseline_px * found.camera.fx / self.camera.fx
+            return StereoDepth(self.camera, found, StereoImages(left, right, baseline_px), self.baseline_px)
         if depth is None:
             return None
         self.camera.check_image(depth, f"the depth image of frame {index}")

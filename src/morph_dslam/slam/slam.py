@@ -43,7 +43,7 @@ class Slam:
 
     Parameters
     ----------
-    camera : of all frames; a stereo pair, whose rectified left camera is then what the map and the poses are of
+    camera : of all frames; a stereo pair, whose left camera is then what the map and the poses are of
     options : when to keep the map as it is, or to give it up
     with_depth : whether frames come with depth images that belong to them pixel by pixel
     threaded : whether the map is made beside the frames, in a thread that they never wait for, instead of in
@@ -103,7 +103,7 @@ class Slam:
         self._begin(rigid_map)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image (h, w[, 3]) as ``camera`` would have seen it; stereo: the left one, rectified."""
+        """An image (h, w[, 3]) as ``camera`` would have seen it; stereo: the left one."""
         return self.frame_images.undistort(image)
 
     def reset(self) -> None:
