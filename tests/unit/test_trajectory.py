@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import TrajectoryError
+from morph_dslam.errors import CameraError, TrajectoryError
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.colmap import ColmapImage, write_colmap_model
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
@@ -64,6 +64,53 @@ def test_seven_scenes_poses_are_made_orthonormal(tmp_path):
     trajectory = load_trajectory(tmp_path)
     np.testing.assert_array_equal(trajectory.timestamps, [1.0])
     np.testing.assert_allclose(trajectory.world_from_camera[0, :3, :3], QUARTER, atol=1e-12)
+
+
+def rigid(vector, shift):
+    """A pose (4, 4) by its rotation vector, degrees, and its place."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(vector, degrees=True).as_matrix(), shift
+    return matrix
+
+
+def sensor_file(folder, body_from_sensor):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "sensor.yaml").write_text(
+        f"%YAML:1.0\nT_BS:\n  cols: 4\n  rows: 4\n  data: {body_from_sensor.ravel().tolist()}\n"
+    )
+
+
+@pytest.mark.parametrize("kind", ["state_groundtruth_estimate0", "vicon0"])
+def test_euroc_poses_of_the_body_become_those_of_cam0(tmp_path, kind):
+    world_from_camera = [rigid((10.0 * i, -20.0, 5.0), (0.1 * i, 0.2, -0.3)) for i in range(3)]
+    body_from_camera, body_from_sensor = rigid((3.0, -4.0, 90.0), (-0.02, -0.06, 0.01)), np.eye(4)
+    base = tmp_path / "mav0"
+    path = base / kind / "data.csv"
+    path.parent.mkdir(parents=True)
+    if kind == "vicon0":  # a marker of its own on the body
+        body_from_sensor = rigid((0.0, 30.0, 0.0), (0.08, 0.0, -0.01))
+        sensor_file(path.parent, body_from_sensor)
+    lines = [
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x [m]"
+    ]
+    for i, pose in enumerate(world_from_camera):
+        world_from_sensor = pose @ np.linalg.inv(body_from_camera) @ body_from_sensor
+        x, y, z, w = Rotation.from_matrix(world_from_sensor[:3, :3]).as_quat()
+        values = ",".join(f"{value:.9f}" for value in (*world_from_sensor[:3, 3], w, x, y, z))
+        lines.append(f"{1403636579763555584 + 50_000_000 * i},{values},nan")
+    write(path, "\n".join(lines) + "\n")
+    with pytest.raises(TrajectoryError, match=r"EuRoC's body, and there is no .*cam0/sensor.yaml.*leave the file in"):
+        load_trajectory(path)
+    sensor_file(base / "cam0", body_from_camera)
+    found = load_trajectory(path)
+    np.testing.assert_allclose(found.world_from_camera, world_from_camera, atol=1e-8)
+    assert found.timestamps == pytest.approx(1403636579.763555584 + 0.05 * np.arange(3), abs=1e-6)
+    write(path, lines[0] + "\n1403636579763555584,1.0\n")
+    with pytest.raises(TrajectoryError, match="line 2 has 2 values"):
+        load_trajectory(path)
+    (base / "cam0" / "sensor.yaml").write_text("rate_hz: 20\n")
+    with pytest.raises(CameraError, match="T_BS is not a list of numbers"):
+        load_trajectory(path)
 
 
 def test_what_is_saved_is_read_back(tmp_path):

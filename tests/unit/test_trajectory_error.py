@@ -182,6 +182,34 @@ def test_a_truth_in_other_axes_is_named_with_the_turn():
     assert found == pytest.approx(vector.tolist(), abs=0.3)
 
 
+@pytest.mark.parametrize("vector", [(0.05, -1.0, -0.4), (1.0, 0.0, 3.5)])
+def test_a_small_turn_of_the_axes_is_named_where_it_makes_the_error_of_motions(vector):
+    # It turns so little that the turns alone do not show it.
+    slow, body = swaying(), np.eye(4)
+    slow.world_from_camera[:, :3, :3] = Rotation.from_rotvec(
+        0.3 * Rotation.from_matrix(slow.world_from_camera[:, :3, :3]).as_rotvec()
+    ).as_matrix()
+    body[:3, :3] = Rotation.from_rotvec(vector, degrees=True).as_matrix()
+    estimate = with_noise(slow, 0.2, 0.005)
+    assert evaluate_trajectory(estimate, slow)["notes"] == []
+    (note,) = evaluate_trajectory(estimate, seen_from_body(slow, body))["notes"]
+    found = [float(word) for word in note.split("rotation vector ")[1].split(" degrees")[0].split(",")]
+    assert found == pytest.approx(vector, abs=0.15)
+    # White noise of 0.2 mm at both ends of a motion in each coordinate.
+    assert float(note.split("differ by ")[1].split(" mm")[0]) == pytest.approx(0.2 * np.sqrt(6.0), rel=0.15)
+
+
+def test_errors_without_a_turn_of_the_axes_name_none():
+    truth = swaying()
+    for seed in range(40):
+        rng, poses = np.random.default_rng(seed), truth.world_from_camera.copy()
+        waves = np.sin(np.outer(np.linspace(0.0, 1.0, len(poses)), rng.uniform(2.0, 40.0, 6)) + 6.0 * rng.random(6))
+        poses[:, :3, 3] += 0.01 * waves[:, :3]
+        poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(0.01 * waves[:, 3:]).as_matrix()
+        notes = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth)["notes"]
+        assert not any("rotation vector" in note for note in notes)
+
+
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (20.0, -70.0, 45.0)])
 def test_a_truth_of_a_point_beside_the_camera_is_named_with_the_lever(vector):
     truth, body = swaying(), np.eye(4)

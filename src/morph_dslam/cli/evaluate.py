@@ -21,7 +21,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="CURVE[:COLUMN]",
         help="measured forces, CSV by frame or by a parameter such as stroke_mm",
     )
-    add_file(truth, "--trajectory", "true camera path (TUM, KITTI, COLMAP or 7-Scenes)", "TRUTH")
+    add_file(truth, "--trajectory", "true camera path (TUM, KITTI, COLMAP, EuRoC or 7-Scenes)", "TRUTH")
     add_file(
         truth, "--depth", "depth.h5 of a simulation, a recording with depth, or a folder of 16-bit images", "DEPTH"
     )

@@ -22,8 +22,9 @@ SPAN = 0.1
 FEW_PAIRS = 0.5
 #: Metric paths are alike in size up to this factor.
 ALIKE = 1.25
-#: Axes that differ by less are a matter of calibration, degrees. A lever is not worth a word below this error, metres.
-LEAST_AXES_DEG, LEAST_ERROR_M = 3.0, 0.002
+#: Axes that differ by less may be a matter of calibration, degrees. Levers and small turns of the axes are not worth a
+#: word below this error, metres.
+CALIBRATED_DEG, LEAST_ERROR_M = 3.0, 0.002
 #: Differences of turns that are rounding, degrees; the least part of the largest singular value that tells.
 ROUNDING_DEG, LEAST_SINGULAR = 1e-6, 1e-2
 
@@ -41,7 +42,7 @@ def pose_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
         text, own, true, after = "", estimate, truth, given
     axes = _axes_of_body(own, true)
     angle, turned = float(np.degrees(Rotation.from_matrix(axes).magnitude())), _turned(own, axes)
-    if angle > LEAST_AXES_DEG and after > max(CLEARLY * _turn_difference(turned, true), LEAST_DEG):
+    if angle > CALIBRATED_DEG and after > max(CLEARLY * _turn_difference(turned, true), LEAST_DEG):
         named = ", ".join(f"{value:.4g}" for value in np.degrees(rotation_log(axes)))
         text = (
             f"the axes of the truth's poses differ from those of the camera (x right, y down, z forward) by a constant "
@@ -49,9 +50,48 @@ def pose_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
             "the camera sits on, or has other axes. Multiply its rotations by the inverse turn from the right"
         )
         own, after = turned, _turn_difference(turned, true)
+    elif not text:
+        yield from _small_turn_notes(own, turned, true, axes)
     if text:
         yield f"{text}; the turns of the paths then differ by {after:.2g} degrees, not by {given:.2g}"
     yield from _lever_notes(own, true)
+
+
+def _small_turn_notes(own: Trajectory, turned: Trajectory, true: Trajectory, axes: Array) -> Iterator[str]:
+    """That a constant turn (3, 3) of the axes makes most of the error of motions.
+
+    A camera that goes along an axis that is off by a degree is off by a sixtieth of its way, however little it turns.
+    The axes are found by the turns alone, so that motions that agree with them are a second witness.
+    """
+    before, after = _motion_error(own, true), _motion_error(turned, true)
+    if before > max(CLEARLY * after, LEAST_ERROR_M):
+        named = ", ".join(f"{value:.4g}" for value in np.degrees(rotation_log(axes)))
+        yield (
+            "the axes of the truth's poses differ from those of the camera by a constant turn with the rotation vector "
+            f"{named} degrees in camera axes, as of another body or camera, of rectified images or a principal point "
+            f"that is off: with the turn undone, motions over a tenth of the path differ by {1e3 * after:.2g} mm, not "
+            f"by {1e3 * before:.2g}"
+        )
+
+
+def _motion_error(estimate: Trajectory, truth: Trajectory) -> float:
+    """Root mean square difference of the ways over `SPAN` in the paths' own axes, metres, of paths made alike in size.
+
+    Infinite where there is no size.
+    """
+    try:
+        scale = fit_similarity(estimate.positions, truth.positions, with_scale=True).scale
+    except ValueError:
+        return np.inf
+    own, true = (_ways(path) for path in (estimate, truth))
+    return float(np.sqrt(np.mean(np.sum((scale * own - true) ** 2, axis=1))))
+
+
+def _ways(path: Trajectory) -> Array:
+    """Ways (m, 3) over `SPAN` of a path, in the axes of the pose that each begins with."""
+    step = max(1, int(SPAN * len(path)))
+    moved = path.positions[step:] - path.positions[:-step]
+    return np.einsum("kji,kj->ki", path.world_from_camera[:-step, :3, :3], moved)
 
 
 def _best_convention(estimate: Trajectory, truth: Trajectory) -> tuple[str, Trajectory, Trajectory]:

@@ -1,4 +1,4 @@
-"""Camera trajectories: TUM files, COLMAP's images.txt, KITTI files, and 7-Scenes folders of poses."""
+"""Camera trajectories: files of TUM, COLMAP (images.txt), KITTI and EuRoC, and 7-Scenes folders of poses."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import TrajectoryError
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.camera_files import load_body_from_sensor
 from morph_dslam.io.text import read_text
 
 Array = NDArray[np.float64]
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 LARGEST = 1e20
 #: Quaternions and matrices are written with few digits; more than this off, they are no rotations.
 ROTATION_TOLERANCE = 0.02
+#: Columns that only EuRoC's poses of a body have, by their names in the first line.
+EUROC_COLUMNS = ("p_RS_R_x", "q_RS_w")
 #: 7-Scenes were recorded at 30 frames a second and carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
 
@@ -68,10 +71,12 @@ def load_trajectory(path: Path) -> Trajectory:
     Parameters
     ----------
     path : a TUM file (timestamp tx ty tz qx qy qz qw), a KITTI file (twelve numbers a line, stamped with the
-        line's number from 0), COLMAP's images.txt (stamped with the last number in each image's name), or a
-        folder of 7-Scenes with `frame-000000.pose.txt` (stamped with the frame's number / 30)
+        line's number from 0), COLMAP's images.txt (stamped with the last number in each image's name), EuRoC's
+        data.csv of the body in its recording, whose `cam0/sensor.yaml` gives the camera's poses, or a folder of
+        7-Scenes with `frame-000000.pose.txt` (stamped with the frame's number / 30)
 
-    Raises TrajectoryError if it is missing, empty, or of none of these kinds, or a line is no pose.
+    Raises TrajectoryError if it is missing, empty, or of none of these kinds, a line is no pose, or EuRoC's camera is
+    not found, and CameraError if it does not say where it is on the body.
     """
     path = Path(path)
     if path.is_dir():
@@ -79,6 +84,8 @@ def load_trajectory(path: Path) -> Trajectory:
     lines = read_text(path, "trajectory", TrajectoryError).splitlines()
     if path.name == "images.txt" or any(line.startswith("# Image list") for line in lines[:5]):
         return _make(path, _colmap_rows(path, lines))
+    if lines and all(name in lines[0] for name in EUROC_COLUMNS):
+        return _make(path, _euroc_rows(path, lines))
     return _make(path, _table_rows(path, lines))
 
 
@@ -133,6 +140,27 @@ def _table_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
                 f"{where} has {len(values)} numbers: a TUM file has timestamp tx ty tz qx qy qz qw, a KITTI file twelve"
             )
         row += 1
+
+
+def _euroc_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
+    """Poses of cam0 by those of the body, or of a sensor on it: nanoseconds, position, quaternion with w first."""
+    sensor, camera = path.with_name("sensor.yaml"), path.resolve().parents[1] / "cam0" / "sensor.yaml"
+    if not camera.is_file():
+        raise TrajectoryError(
+            f"{path} holds poses of EuRoC's body, and there is no {camera}, which says where the camera is on it: "
+            "leave the file in its folder in mav0 of the recording, or copy cam0/sensor.yaml to there"
+        )
+    sensor_from_camera = load_body_from_sensor(camera)
+    if sensor.is_file():
+        sensor_from_camera = load_body_from_sensor(sensor).inverse @ sensor_from_camera
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        where, words = f"{path}, line {number}", line.split(",")
+        if len(words) < 8:
+            raise TrajectoryError(f"{where} has {len(words)} values: a pose is a time, three of place and four of turn")
+        values = _numbers(words[:8], where)
+        yield values[0] / 1e9, _pose(np.roll(values[4:], -1), values[1:4], where) @ sensor_from_camera.matrix
 
 
 def _colmap_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
