@@ -348,6 +348,10 @@ def test_a_kalibr_chain(tmp_path):
     pair = load_camera_or_pair(path)
     assert (pair.left, pair.right) == (LEFT, RIGHT)
     np.testing.assert_allclose(pair.right_from_left.matrix, RIGHT_IN_LEFT.inverse.matrix, atol=1e-12)
+    # The readout time, which may be added, is that of the camera alone and in the pair: their maps are the same.
+    chain["cam0"]["readout_s"] = 0.02
+    path.write_text(yaml.safe_dump(chain))
+    assert load_camera_or_pair(path).left == load_camera(f"{path}#cam0") == replace(LEFT, readout_s=0.02)
     del chain["cam1"]["T_cn_cnm1"]
     path.write_text(yaml.safe_dump(chain))
     with pytest.raises(CameraError, match="cam1: T_cn_cnm1 is not a list of numbers"):
@@ -372,6 +376,9 @@ def test_euroc_gives_both_poses_in_the_body(tmp_path):
         np.testing.assert_allclose(pair.right_from_left.matrix, RIGHT_IN_LEFT.inverse.matrix, atol=1e-12)
         # Where one camera is needed, as that of the pair's map, it is the left one.
         assert load_camera(given) == LEFT
+    with (tmp_path / "mav0" / "cam0" / "sensor.yaml").open("a") as file:
+        file.write("readout_s: 0.02\n")
+    assert load_camera_or_pair(tmp_path).left == load_camera(tmp_path) == replace(LEFT, readout_s=0.02)
     for load in (load_camera, load_camera_or_pair):
         with pytest.raises(CameraError, match=r"is a folder.*cam0/sensor.yaml: give a camera file"):
             load(tmp_path / "mav0" / "cam1")

@@ -89,12 +89,7 @@ def load_camera(path: str | Path) -> Camera:
         content = _choose(chain, name, path)
     elif name is not None:
         raise CameraError(f"{path} holds one camera only: leave out #{name}")
-    translate = _translator_of(content) if isinstance(content, dict) else None
-    if translate is not None:
-        given = cast(dict, content)
-        # Other programs have no key for the readout time: ours may be added to their files.
-        content = translate(given, where) | {key: given[key] for key in ("readout_s",) if key in given}
-    return parse_camera(content, where)
+    return _translated_camera(content, where)
 
 
 def load_camera_or_pair(path: str | Path) -> Camera | StereoCamera:
@@ -235,7 +230,7 @@ def _cameras_of_kalibr(path: Path, chain: Mapping, count: int) -> list[tuple[Cam
         where, entry = f"{path}#cam{number}", chain[f"cam{number}"]
         if number:
             pose = _transform(entry.get("T_cn_cnm1"), f"{where}: T_cn_cnm1") @ pose
-        cameras.append((parse_camera(_from_kalibr(entry, where), where), pose))
+        cameras.append((_translated_camera(entry, where), pose))
     return cameras
 
 
@@ -257,10 +252,7 @@ def _pair_of_euroc(folder: Path) -> StereoCamera:
     cameras, poses = [], []
     for name in ("cam0", "cam1"):
         file = base / name / "sensor.yaml"
-        content = _read_yaml(file)
-        if not isinstance(content, dict):
-            raise CameraError(f"{file} holds no camera")
-        cameras.append(parse_camera(_from_kalibr(content, str(file)), str(file)))
+        cameras.append(load_camera(file))
         poses.append(load_body_from_sensor(file))
     return StereoCamera(cameras[0], cameras[1], poses[1].inverse @ poses[0])
 
@@ -274,6 +266,16 @@ def _transform(value: object, what: str) -> RigidTransform:
     if np.abs(singular - 1.0).max() > 1e-3 or np.linalg.det(u @ vt) < 0.0:
         raise CameraError(f"{what} is not a rotation and a translation")
     return RigidTransform(u @ vt, matrix[:3, 3])
+
+
+def _translated_camera(content: object, where: str) -> Camera:
+    """The camera of a file of our own or of another program; errors as of `load_camera`."""
+    translate = _translator_of(content) if isinstance(content, dict) else None
+    if translate is not None:
+        given = cast(dict, content)
+        # Other programs have no key for the readout time: ours may be added to their files.
+        content = translate(given, where) | {key: given[key] for key in ("readout_s",) if key in given}
+    return parse_camera(content, where)
 
 
 def _translator_of(content: Mapping) -> Callable[[Mapping, str], Mapping] | None:
