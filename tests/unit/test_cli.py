@@ -261,7 +261,8 @@ def test_an_interrupt_is_not_lost_where_errors_cannot_be_raised(number, capsys):
 
 
 def test_progress_in_a_log_is_a_line_in_ten_seconds():
-    code = "from morph_dslam.cli import main; main(['info', 'absent.morph']); import tqdm; print(tqdm.tqdm([]).mininterval)"
+    code = "from morph_dslam.cli import main; main(['info', 'absent.morph'])"
+    code += "; import tqdm; print(tqdm.tqdm([]).mininterval)"
     known = {name: value for name, value in os.environ.items() if not name.startswith("TQDM_")}
     for given, interval in (({}, 10.0), ({"TQDM_MININTERVAL": "3"}, 3.0)):
         run = subprocess.run(

@@ -62,7 +62,7 @@ def test_a_right_reference_is_left_where_it_is():
 
 
 def test_a_refined_reference_is_off_by_what_is_stated():
-    """Landmarks a pixel off, and points that were read off the reference view by 0.4 px wrongly, alike in all frames."""
+    """Landmarks a pixel off, and points read off the reference view 0.4 px beside their places, alike in all frames."""
     model, truth, off = bent_sheet_model(22, 16), sheet_state(0.0), []
     for seed in range(6):
         rng = np.random.default_rng(seed)
