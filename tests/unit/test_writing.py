@@ -154,6 +154,7 @@ def test_runs(tmp_path: Path) -> None:
         with pytest.raises(TrackingError, match=rf"cannot write .*{name}: File too large"), largest_file(size):
             run.write()
         assert not (tmp_path / "run" / name).exists()
+        assert len((tmp_path / "run" / "frames.csv").read_text().splitlines()) == 2
     run.write()
 
 

@@ -107,12 +107,13 @@ class RunFolder:
 
     def _write(self, facts: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
         run, path, notices = self.results, self.path, [*notices, *self._repeated.notices()]
-        write_hdf5(path / "result.h5", run)
-        self._centres.write(path / "result.h5")
+        # The small files first: a full disk keeps these at least.
         write_csv(path / "frames.csv", run)
         save_trajectory(path / "trajectory.txt", camera_path(run))
-        save_model(path / "model.morph", run.model.without_loads)
         save_camera(path / "camera.yaml", self._camera)
+        write_hdf5(path / "result.h5", run)
+        self._centres.write(path / "result.h5")
+        save_model(path / "model.morph", run.model.without_loads)
         summary = summarise(run, notices) | facts | {"versions": _versions()}
         (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
         from morph_dslam.tracking.run_plots import write_plots  # matplotlib takes long to load
