@@ -14,6 +14,7 @@ from morph_dslam.studies.rigid import build_rigid
 from morph_dslam.tracking.camera_check import CameraCheck
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints, State
+from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 320.0, 240.0)
 CUBE = """v -50 -50 -50\nv -50 50 -50\nv 50 -50 -50\nv 50 50 -50\nv -50 -50 50\nv -50 50 50\nv 50 -50 50\nv 50 50 50
@@ -65,3 +66,57 @@ def test_a_still_object_shows_nothing(points):
 
 def test_nothing_seen_gives_no_estimate():
     assert CameraCheck(CAMERA, deforms=True).estimate() is None
+
+
+def of_sheet(bound, given, believed, tells):
+    """The check after 40 frames of a sheet that arches and turns; its arch is ``believed`` times the true one.
+
+    ``tells`` : whether the check is told by how much the sheet would move if the arch were off by a tenth.
+    """
+    check, rng = CameraCheck(given, deforms=True), np.random.default_rng(1)
+
+    def place(arch):
+        return bound.rest + bound.field.value(np.array([arch, 0.0, 0.0]))
+
+    for k in range(40):
+        turn = np.sin(0.3 * k)
+        axis, arch = np.array([0.1 * np.sin(0.2 * k), 0.25 * turn, 0.0]), 0.03 + 0.02 * turn**2
+        shift = np.array([0.02 * np.sin(0.3 * k), 0.0, 0.5])
+        seen = cv2.projectPoints(place(arch), axis, shift, CAMERA.matrix, None)[0][:, 0]
+        seen = seen + 0.1 * rng.standard_normal(seen.shape)
+        found = place(believed * arch)
+        _, spin, moved = cv2.solvePnP(found, seen, given.matrix, None, axis, shift.copy(), True)
+        spin, moved = np.ravel(spin).astype(float), np.ravel(moved).astype(float)
+        state = State(
+            np.array([believed * arch, 0.0, 0.0]), RigidTransform(Rotation.from_rotvec(spin).as_matrix(), moved)
+        )
+        there, larger = (
+            cv2.projectPoints(points, spin, moved, given.matrix, None)[0][:, 0]
+            for points in (found, place(1.1 * believed * arch))
+        )
+        errors = (larger - there)[:, :, None]
+        keyframe = Keyframe(seen, np.ones(len(seen)), state, 0.1)
+        check.add(k / 30.0, bound, keyframe, (lambda errors=errors: errors) if tells else None)
+    return check.estimate()
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    model = bent_sheet_model()
+    return BoundPoints.from_surface(model, spread_over(model.nodes, model.triangles, 200))
+
+
+def test_an_error_of_the_deformation_that_was_to_be_expected_is_no_wrong_camera(sheet):
+    """With an arch that is nine tenths of the true one, as by a coarse mesh and a sensor that tells its load."""
+    unaware = of_sheet(sheet, CAMERA, 0.9, tells=False).terms["focal"]
+    aware = of_sheet(sheet, CAMERA, 0.9, tells=True).terms["focal"]
+    assert abs(unaware.estimated[0] - 600.0) > 3.0 * unaware.std[0]
+    assert abs(aware.estimated[0] - 600.0) < 2.6 * aware.std[0]
+    assert not aware.is_wrong
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_wrong_camera_is_named_with_such_errors_to_be_expected(sheet, factor):
+    focal = of_sheet(sheet, replace(CAMERA, fx=600.0 * factor, fy=600.0 * factor), 1.0, tells=True).terms["focal"]
+    assert focal.is_wrong
+    assert focal.is_observable

@@ -85,6 +85,47 @@ def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, est
         assert predicted == pytest.approx(off_by, rel=0.1), k
 
 
+def by_deformation(points, state):
+    """By how much the deformation moves the pixels (p, 2) of points."""
+    return CAMERA.project(points.in_camera(state)) - CAMERA.project(state.camera_from_object.apply(points.rest))
+
+
+def test_what_the_deformation_moves_points_by_is_off_as_predicted(model, estimator, pixels):
+    """A reference state that is off, and a parameter that a sensor tells and that moves the object less than stated."""
+    true_points = bound(model, REFERENCE, pixels)
+    seen, used = CAMERA.project(true_points.in_camera(LATER)), np.ones(len(pixels), dtype=bool)
+    for k, size in ((0, 2e-4), (1, 2e-3), (2, 5e-4), (3, 3e-4), (4, 3e-4)):
+        step = np.eye(9)[k] * size
+        off = moved(REFERENCE, step)
+        points = bound(model, off, pixels)
+        found = estimator.estimate(points, seen, np.ones(len(pixels)), LATER)
+        errors = errors_of(estimator, points, off, np.outer(step, step))
+        errors.added(found, used, 0.0)
+        columns = errors.deformation_errors(found.state, np.zeros((3, 0)), 0.0)()
+        wrong = by_deformation(points, found.state) - by_deformation(true_points, LATER)
+        predicted = columns.sum(axis=2)
+        predicted *= np.sign(np.sum(predicted * wrong))
+        assert np.linalg.norm(predicted - wrong) < 0.15 * np.linalg.norm(wrong), k
+
+
+def test_the_images_make_no_error_of_the_model_good_in_a_parameter_that_a_sensor_tells(model, pixels):
+    """The object has 1 % more arch than the model at the same value, which is known to a thousandth of its range."""
+    points, change = bound(model, REFERENCE, pixels), 0.01 * LATER.parameters[0] * np.eye(3)[:, :1]
+    truth = replace(LATER, parameters=LATER.parameters + change[:, 0])
+    seen, used = CAMERA.project(points.in_camera(truth)), np.ones(len(pixels), dtype=bool)
+    for is_known in (True, False):
+        estimator = Estimator(model, CAMERA, EstimationOptions(huber_px=50.0))
+        if is_known:
+            estimator.known.tell({"arch": (float(LATER.parameters[0]), 1e-6)})
+        found = estimator.estimate(points, seen, np.ones(len(pixels)), LATER)
+        errors = errors_of(estimator, points, REFERENCE, np.zeros((9, 9)))
+        errors.added(found, used, 0.0)
+        column = errors.deformation_errors(found.state, change, 0.0)()[:, :, 9]
+        missed = by_deformation(points, truth) - by_deformation(points, found.state)
+        expected = by_deformation(points, truth) - by_deformation(points, LATER)
+        assert np.linalg.norm(column - missed) < 0.05 * np.linalg.norm(expected)
+
+
 def test_in_the_reference_view_itself_the_error_is_that_of_the_reference(model, estimator, pixels):
     points = bound(model, REFERENCE, pixels)
     root = np.random.default_rng(1).standard_normal((9, 9)) * estimator.scale[:, None] * 1e-3

@@ -70,3 +70,8 @@ class ModelErrors:
             covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own])
             squared += self.reduction.size**2
         return ModelDeviation(covariance, float(np.sqrt(squared)))
+
+    def in_common(self, mu: Array) -> tuple[Array, float]:
+        """What is alike in all states: errors (d, k) of the parameters, SI, and of the displacement, as of `at`."""
+        factors = np.zeros((len(mu), 0)) if self.mesh is None else self.mesh.factors(mu)
+        return factors, self.at(mu).displacement

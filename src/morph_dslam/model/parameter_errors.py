@@ -146,9 +146,12 @@ class ParameterErrors:
 
     def at(self, mu: Array) -> tuple[Array, float]:
         """Covariance (d, d) of the parameters at a state ``mu`` (d,), SI, and the error of the displacement left, m."""
-        squared = self._squared(mu)
-        covariance = squared * self.per_metre.T @ self.per_metre / len(self.per_metre)
-        return covariance, self.left_share * float(np.sqrt(squared))
+        factors = self.factors(mu)
+        return factors @ factors.T, self.left_share * float(np.sqrt(self._squared(mu)))
+
+    def factors(self, mu: Array) -> Array:
+        """Errors (d, k) of the parameters at a state ``mu`` (d,), SI, alike in all states: their squares add up."""
+        return np.asarray(np.sqrt(self._squared(mu) / len(self.per_metre)) * self.per_metre.T)
 
     def _squared(self, mu: Array) -> float:
         """Mean square displacement of the surface, squared metres.

@@ -3,12 +3,13 @@
 Poses, points and camera are adjusted together with a prior on the camera (Triggs et al., Bundle Adjustment - A Modern
 Synthesis, 2000); poses and points are eliminated. Residuals of one point in many images are alike, as are those of one
 image: deviations are those of clusters of residuals by point and by image (Cameron and Miller, A Practitioner's Guide
-to Cluster-Robust Inference, 2015), not of independent pixels.
+to Cluster-Robust Inference, 2015), not of independent pixels. Errors of known size that are alike in all images are
+further unknowns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -27,6 +28,8 @@ from morph_dslam.slam.rolling_shutter import after, middle_row_pixels, row_times
 from morph_dslam.threads import one_thread_for_algebra
 
 Array = NDArray[np.float64]
+#: By how much the points (p, 2, c) of a map are off in a frame, pixels, for each of c error factors in its deviation.
+OffByFactors = Callable[[], Array]
 #: What can be estimated of a camera.
 CameraTerm = Literal["focal", "centre", "radial", "tangential", "readout"]
 TERMS: tuple[CameraTerm, ...] = get_args(CameraTerm)
@@ -49,6 +52,8 @@ ENOUGH_KEYFRAMES = 10
 LEAST_VIEWS, LEAST_SEEN, LEAST_CONNECTED = 3, 20, 0.8
 #: Rounds with the velocities of the round before; iterations in each, which end with a gain below this part.
 ROUNDS, ITERATIONS, LEAST_GAIN = 3, 15, 1e-4
+#: All images together count for so many independent points where they tell of error factors.
+EFFECTIVE_POINTS = 30.0
 #: Width of the Huber cost while poses and points are fitted to another camera.
 START_HUBER_PX = 20.0
 #: Steps of the numerical derivatives: of a point, in depths, and of the camera's unknowns.
@@ -171,6 +176,7 @@ class _Views:
     points : (p, 3).
     frame_idx, point_idx : (o,), each pair once.
     recorded : (o, 2) pixels.
+    off : (o, 2, c) by how much ``recorded`` is off, pixels, for each of c error factors, in their deviations.
     """
 
     poses: Array
@@ -179,17 +185,20 @@ class _Views:
     frame_idx: Indices
     point_idx: Indices
     recorded: Array
+    off: Array
 
     def local(self) -> Array:
         """Points (o, 3) in the axes of their cameras at the middle rows' instants."""
         poses = self.poses[self.frame_idx]
         return np.einsum("oij,oj->oi", poses[:, :3, :3], self.points[self.point_idx]) + poses[:, :3, 3]
 
-    def residuals(self, camera: Camera) -> Array:
-        """(o, 2) pixels; of a point that the camera cannot see far off."""
+    def residuals(self, given: Camera, unknowns: Array) -> Array:
+        """(o, 2) pixels, of a camera changed by so much (8 + c,); of a point that it cannot see far off."""
+        camera = changed(given, unknowns)
         seconds = camera.readout_s * row_times(self.recorded[:, 1], camera)
         seen = after(self.local(), self.twists[self.frame_idx], seconds)
-        return np.nan_to_num(camera.project_recorded(seen) - self.recorded, nan=1e3)
+        off = camera.project_recorded(seen) - self.recorded + self.off @ unknowns[N_UNKNOWNS:]
+        return np.nan_to_num(off, nan=1e3)
 
     def moved(self, pose_steps: Array, point_steps: Array) -> _Views:
         """With twists of the poses (f, 6) and shifts of the points (p, 3)."""
@@ -199,7 +208,7 @@ class _Views:
         return replace(self, poses=poses, points=self.points + point_steps)
 
     def derivatives(self, given: Camera, unknowns: Array) -> tuple[Array, Array, Array]:
-        """Of the residuals by pose twists (o, 2, 6), points (o, 2, 3) and the camera's unknowns (o, 2, 8)."""
+        """Of the residuals by pose twists (o, 2, 6), points (o, 2, 3) and unknowns (o, 2, 8 + c)."""
         camera, twists, local = changed(given, unknowns), self.twists[self.frame_idx], self.local()
         times = row_times(self.recorded[:, 1], camera)
         seen = after(local, twists, camera.readout_s * times)
@@ -217,12 +226,13 @@ class _Views:
         by_point = by_local @ self.poses[self.frame_idx][:, :3, :3]
         by_camera = np.empty((len(local), 2, N_UNKNOWNS))
         for column, step in enumerate(CAMERA_STEPS):
-            change = step * np.eye(N_UNKNOWNS)[column]
+            change = step * np.eye(len(unknowns))[column]
             upper, lower = changed(given, unknowns + change), changed(given, unknowns - change)
             by_camera[:, :, column] = (upper.project_recorded(seen) - lower.project_recorded(seen)) / (2.0 * step)
         velocity = np.cross(twists[:, :3], seen) + twists[:, 3:]
         by_camera[:, :, 7] = np.einsum("oij,oj->oi", by_seen, velocity) * times[:, None]
-        return np.nan_to_num(by_pose), np.nan_to_num(by_point), np.nan_to_num(by_camera)
+        by_unknowns = np.concatenate([by_camera, self.off], axis=2)
+        return np.nan_to_num(by_pose), np.nan_to_num(by_point), np.nan_to_num(by_unknowns)
 
 
 class _Normal:
@@ -289,8 +299,8 @@ class _Normal:
         rest = self._point_right - (self._cross.T @ step).reshape(-1, 3)
         return step[: self._n].reshape(-1, 6), np.einsum("pij,pj->pi", self._inverse, rest), step[self._n :]
 
-    def covariance(self, information: Array, variance: float) -> Array:
-        """Of the camera's unknowns (s, s), by clusters of residuals, and by a prior of this ``information`` (s,)."""
+    def covariance(self, information: Array, prior_std: Array) -> Array:
+        """Of the unknowns (s, s), by clusters of residuals, and by a prior (s,) of such deviations and information."""
         views, (by_pose, by_point, by_camera) = self._views, self._derivatives
         size, n = len(self._reduced), self._n
         inverse = np.linalg.solve(self._reduced, np.eye(size)[:, n:])
@@ -298,7 +308,7 @@ class _Normal:
         influence = by_pose @ inverse[:n].reshape(len(views.poses), 6, size - n)[views.frame_idx]
         influence = influence + by_camera @ inverse[n:] - by_point @ of_points[views.point_idx]
         scores = np.einsum("o,oki,ok->oi", self._weights, influence, self._residuals)
-        result = inverse[n:].T @ np.diag(variance * information) @ inverse[n:]
+        result = inverse[n:].T @ np.diag((information * prior_std) ** 2) @ inverse[n:]
         n_residuals, n_unknowns = 2 * len(scores), 3 * len(views.points) + size
         for groups in (views.frame_idx, views.point_idx):
             sums = np.zeros((groups.max() + 1, size - n))
@@ -309,7 +319,7 @@ class _Normal:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Views, the camera's unknowns (8,), the covariance (s, s) of those that were free, and the cost, px^2."""
+    """Views, the unknowns (8 + c,), the covariance (s, s) of those that were free, and the cost, px^2."""
 
     views: _Views
     unknowns: Array
@@ -319,20 +329,23 @@ class _Solution:
 
 def _solve(views: _Views, given: Camera, unknowns: Array, free: Indices, huber_px: float | None = None) -> _Solution:
     """Levenberg-Marquardt on the Huber cost, of the width that fits the errors by default, and the prior."""
-    errors = np.linalg.norm(views.residuals(changed(given, unknowns)), axis=1)
+    errors = np.linalg.norm(views.residuals(given, unknowns), axis=1)
     usual = float(np.median(errors))
     width = huber_px or min(max(HUBER_RATIO * usual, LEAST_HUBER_PX), MOST_HUBER_PX)
     # The median length of two normal deviations is 1.18 of their standard deviation.
     variance = max(usual / 1.18, 0.1) ** 2
-    information = variance / _prior_std(given)[free] ** 2
+    prior_std = np.append(_prior_std(given), np.ones(len(unknowns) - N_UNKNOWNS))
+    information = variance / prior_std[free] ** 2
+    # What residuals have in common in all images tells less of the factors than as many independent ones would.
+    information[free >= N_UNKNOWNS] *= max(len(views.recorded) / EFFECTIVE_POINTS, 1.0)
 
     def cost(views: _Views, unknowns: Array) -> float:
-        errors = np.linalg.norm(views.residuals(changed(given, unknowns)), axis=1)
+        errors = np.linalg.norm(views.residuals(given, unknowns), axis=1)
         terms = np.where(errors < width, 0.5 * errors**2, width * (errors - 0.5 * width))
         return float(terms.sum() + 0.5 * information @ unknowns[free] ** 2)
 
     def normal(damping: float) -> _Normal:
-        residuals = views.residuals(changed(given, unknowns))
+        residuals = views.residuals(given, unknowns)
         weights = np.minimum(1.0, width / np.maximum(np.linalg.norm(residuals, axis=1), 1e-12))
         by_pose, by_point, by_camera = views.derivatives(given, unknowns)
         derivatives = by_pose, by_point, by_camera[:, :, free]
@@ -351,14 +364,21 @@ def _solve(views: _Views, given: Camera, unknowns: Array, free: Indices, huber_p
         damping = max(0.1 * damping, 1e-9)
         if gain < LEAST_GAIN:
             break
-    return _Solution(views, unknowns, normal(0.0).covariance(information, variance), before)
+    return _Solution(views, unknowns, normal(0.0).covariance(information, prior_std[free]), before)
 
 
 class _Recording:
     """A path and the map points that its frames saw; gives the frames that are adjusted."""
 
-    def __init__(self, rigid_map: RigidMap, camera: Camera, path: Trajectory, seen: Sequence[Followed]) -> None:
-        self._camera, self._times, self._seen = camera, path.timestamps, seen
+    def __init__(
+        self,
+        rigid_map: RigidMap,
+        camera: Camera,
+        path: Trajectory,
+        seen: Sequence[Followed],
+        off: Sequence[OffByFactors] | None,
+    ) -> None:
+        self._camera, self._times, self._seen, self._off = camera, path.timestamps, seen, off
         self._poses = path.camera_from_world.copy()
         self._positions = rigid_map.positions.copy()
         sees_enough = np.array([len(points.ids) >= LEAST_SEEN for points in seen])
@@ -404,7 +424,13 @@ class _Recording:
             np.repeat(np.arange(len(chosen)), [int(rows.sum()) for rows in kept]),
             np.concatenate([ids[rows] for ids, rows in zip(chosen, kept, strict=True)]),
             np.concatenate([self._recorded[row][rows] for row, rows in zip(self._rows, kept, strict=True)]),
+            np.concatenate([self._off_in(row)[rows] for row, rows in zip(self._rows, kept, strict=True)]),
         )
+
+    def _off_in(self, row: int) -> Array:
+        """By how much the points of a frame (p, 2, c) are off for each error factor, pixels."""
+        seen = self._seen[row]
+        return np.zeros((len(seen.ids), 2, 0)) if self._off is None else self._off[row]()[seen.ids]
 
     def take_over(self, views: _Views, camera: Camera) -> None:
         """Take the adjusted poses and points, and place the frames beside them anew: velocities rest on these."""
@@ -428,6 +454,7 @@ def estimate_camera(
     path: Trajectory,
     seen: Sequence[Followed],
     terms: Sequence[CameraTerm] = CHECKED,
+    off: Sequence[OffByFactors] | None = None,
 ) -> CameraEstimate:
     """Terms of a camera from the frames of a recording; as known before where there are too few frames or points.
 
@@ -437,9 +464,11 @@ def estimate_camera(
     path : of the camera
     seen : the map points in each of its frames
     terms : to estimate; the others stay, and a fisheye has no tangential ones
+    off : how what was seen in each frame is off by errors that are the same in all of them; these are estimated
+        with the camera, as far as their deviations let them.
     """
     terms = terms_of(camera, terms)
-    recording = _Recording(rigid_map, camera, path, seen)
+    recording = _Recording(rigid_map, camera, path, seen, off)
     if not recording.is_enough:
         return _as_before(camera, terms)
     free = np.array(sorted(column for term in terms for column in COLUMNS[term]))
@@ -447,7 +476,9 @@ def estimate_camera(
         solution = _start(recording.views(), camera, "radial" in terms)
         for _ in range(ROUNDS):
             recording.take_over(solution.views, changed(camera, solution.unknowns))
-            solution = _solve(recording.views(), camera, solution.unknowns, free)
+            views = recording.views()
+            factors = np.arange(N_UNKNOWNS, N_UNKNOWNS + views.off.shape[2])
+            solution = _solve(views, camera, solution.unknowns, np.append(free, factors))
     except (np.linalg.LinAlgError, CameraError):
         return _as_before(camera, terms)  # what the frames have in common determines nothing, or no possible camera
     return _estimate(camera, solution, free, terms)
@@ -473,7 +504,7 @@ def _start(views: _Views, camera: Camera, with_lens: bool) -> _Solution:
 
     From the wrong sign of a strong lens the way down the cost does not lead to the right one.
     """
-    starts = np.zeros((3 if with_lens and camera.distortion else 1, N_UNKNOWNS))
+    starts = np.zeros((3 if with_lens and camera.distortion else 1, N_UNKNOWNS + views.off.shape[2]))
     starts[:, 3:5] = -np.outer(np.arange(len(starts)), _values(camera, "radial"))
     none_free = np.empty(0, dtype=np.int64)
     solutions = [_solve(views, camera, start, none_free, START_HUBER_PX) for start in starts]
@@ -482,7 +513,7 @@ def _start(views: _Views, camera: Camera, with_lens: bool) -> _Solution:
 
 def _estimate(camera: Camera, solution: _Solution, free: Indices, terms: Sequence[CameraTerm]) -> CameraEstimate:
     covariance = np.zeros((N_UNKNOWNS, N_UNKNOWNS))
-    covariance[np.ix_(free, free)] = solution.covariance
+    covariance[np.ix_(free, free)] = solution.covariance[: len(free), : len(free)]
     half_diagonal = 0.5 * float(np.hypot(camera.width, camera.height))
     found = changed(camera, solution.unknowns)
     estimates: dict[CameraTerm, TermEstimate] = {}

@@ -1,10 +1,12 @@
 """The camera as a tracked object shows it, where no map of the scene has checked it.
 
 The points that were followed are taken as those of a rigid object: what the estimated deformation moves them by in the
-image is taken out. Their places, the poses and the camera are then adjusted together, as for a map of a scene. What a
-model of a deformation is off by looks like a wrong principal point or lens: an object that deforms checks the focal
-length and the readout time only. The latter shows even where the model fails, which may be because of it: what it does
-grows with the row and with the velocity, and changes its sign with both.
+image is taken out. Their places, the poses and the camera are then adjusted together, as for a map of a scene. What the
+registration and the model's mesh are off by is alike in all frames and would pass for a wrong camera: it is adjusted,
+too, as far as its deviations let it. What else a model of a deformation is off by looks like a wrong principal point or
+lens: an object that deforms checks the focal length and the readout time only. The latter shows even where the model
+fails, which may be because of it: what it does grows with the row and with the velocity, and changes its sign with
+both.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
-from morph_dslam.slam.self_calibration import TERMS, CameraEstimate, CameraTerm, estimate_camera
+from morph_dslam.slam.self_calibration import TERMS, CameraEstimate, CameraTerm, OffByFactors, estimate_camera
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints
 
@@ -39,8 +41,9 @@ class CameraCheck:
         self._times: list[float] = []
         self._world_from_camera: list[Array] = []
         self._seen: list[Followed] = []
+        self._off: list[OffByFactors] = []
 
-    def add(self, timestamp: float, points: BoundPoints, seen: Keyframe) -> None:
+    def add(self, timestamp: float, points: BoundPoints, seen: Keyframe, errors: OffByFactors | None = None) -> None:
         """Take in a frame.
 
         Parameters
@@ -48,8 +51,9 @@ class CameraCheck:
         timestamp : seconds, later than those before.
         points : p of the first reference view, the same in all frames.
         seen : where the frame shows them.
+        errors : by how much what their deformation moves them by is off; None where nothing is known of that.
         """
-        if len(points) != len(seen.pixels):
+        if len(points) != len(seen.pixels) or (len(self._rest) and not np.array_equal(points.rest, self._rest)):
             return
         pose = seen.state.camera_from_object
         deformed, rest = (
@@ -62,6 +66,8 @@ class CameraCheck:
         self._times.append(timestamp)
         self._world_from_camera.append(pose.inverse.matrix)
         self._seen.append(Followed(ids, pixels[ids]))
+        if errors is not None:
+            self._off.append(errors)
 
     def estimate(self, model_fails: bool = False) -> CameraEstimate | None:
         """The camera by all frames; None where they tell nothing.
@@ -73,7 +79,8 @@ class CameraCheck:
         points = RigidMap()
         points.add_points(self._rest, np.zeros((len(self._rest), 2)), 0, GOOD)
         path = Trajectory(np.array(self._times), np.array(self._world_from_camera))
-        found = estimate_camera(points, self._camera, path, self._seen, self._terms)
+        off = self._off if len(self._off) == len(self._seen) else None
+        found = estimate_camera(points, self._camera, path, self._seen, self._terms, off)
         if not model_fails:
             return found
         readout = found.terms["readout"]

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -231,6 +232,7 @@ class SystematicErrors:
         n_factors = 0 if self._moved is None else self._moved.shape[2]
         self._by_reference = np.zeros((size, n_factors))
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
+        self._by_known = np.zeros((size, size))
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
@@ -285,7 +287,8 @@ class SystematicErrors:
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
-        hessian = frame.hessian + past + self._estimator.known_information(estimate.state.parameters)[0]
+        known = self._estimator.known_information(estimate.state.parameters)[0]
+        hessian = frame.hessian + past + known
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
@@ -312,7 +315,7 @@ class SystematicErrors:
         by_model = gain @ (common_px / np.sqrt(share) * gradients.T + past @ self._by_model)
         covariance += by_model @ by_model.T
         if keeps:
-            self._by_reference, self._by_model = by_reference, by_model
+            self._by_reference, self._by_model, self._by_known = by_reference, by_model, gain @ known
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
     def _learn_reference(self, frame: Linearization, left: Array) -> None:
@@ -365,17 +368,50 @@ class SystematicErrors:
         share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain)
         return np.asarray(gain @ (common_px / np.sqrt(share) * gradients.T), dtype=np.float64)
 
+    def deformation_errors(self, state: State, changes: Array, left: float) -> Callable[[], Array]:
+        """By how much what the deformation moves the pixels by (p, 2, c) may be off in the last frame that was kept.
+
+        The columns are the error factors of the reference, in their deviations, the ``changes`` and the displacement's
+        modes. Where nothing but the images tells of the parameters, these make the changes good.
+
+        Parameters
+        ----------
+        state : of the frame.
+        changes : (d, k) of the parameters which move the surface as errors of the model do, SI.
+        left : of the displacement, by what no parameters make good, root mean square length, metres.
+        """
+        not_made_good = self._by_known[:, : len(changes)] @ changes
+        return partial(self._of_deformation, state, self.reference_factor * self._by_reference, not_made_good, left)
+
+    def _of_deformation(self, state: State, by_reference: Array, not_made_good: Array, left: float) -> Array:
+        modes, rows = self._points.field.modes, self._points.field.functions.rows(state.parameters)
+        d, m = len(rows) - 1, len(modes)
+        # Errors of any smooth shape, as likely one as the other: the modes are the shapes that the object takes.
+        sizes = np.sqrt(m * np.mean(np.sum(modes.astype(np.float64) ** 2, axis=2), axis=1))
+        by_modes = np.diag(left / np.where(sizes > 0.0, sizes, np.inf))
+        all_columns = self._project(state, np.concatenate([rows, by_modes]))[1]
+        all_columns[:, :, d + m :] -= self._project(state, 0.0 * rows)[1][:, :, d:]
+        all_columns[~np.isfinite(all_columns).all(axis=(1, 2))] = 0.0
+        by_state = np.delete(all_columns, np.s_[d : d + m], axis=2)
+        of_reference = by_state @ by_reference
+        if self._moved is not None:
+            pixels = self._estimator.camera.project(state.camera_from_object.apply(self._corners.rest))
+            at_rest = _warped_motions(pixels, self._inverse_edges, self._moved)
+            of_reference += np.sqrt(self._misfit.factor) * (at_rest - self._warped(state, self._moved))
+        return np.concatenate([of_reference, by_state @ not_made_good, all_columns[:, :, d : d + m]], axis=2)
+
     def linearized(self, estimate: Estimate, weights: Array) -> Linearization:
         """The frame of an estimate whose points had these ``weights`` (p,)."""
         _, jacobian = self._project(estimate.state)
         residuals, huber = estimate.residuals[: len(weights)], self._estimator.options.huber_px
         return Linearization(*_counting(jacobian, np.ascontiguousarray(residuals), weights, huber))
 
-    def _project(self, state: State) -> tuple[Array, Array]:
+    def _project(self, state: State, rows: Array | None = None) -> tuple[Array, Array]:
+        """Pixels (p, 2) and their derivatives, by other values and derivatives (1 + d, m) of the functions if given."""
         points, pose = self._points, state.camera_from_object
         return project_with_jacobian(
-            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, self._estimator.camera.intrinsics,
+            points.field.functions.rows(state.parameters) if rows is None else rows, pose.rotation, pose.translation,
+            points.rest, points.field.modes, self._estimator.camera.intrinsics,
         )  # fmt: skip
 
     def _warped(self, state: State, moved: Array) -> Array:

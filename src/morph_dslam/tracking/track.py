@@ -410,7 +410,8 @@ class _Job:
         for name, check in self._checks.items():
             tracker = self._session.trackers[name]
             if tracked.results[name].tracked and isinstance(tracker, Tracker) and tracker.last_seen is not None:
-                check.add(tracked.frame.timestamp, tracker.reference.points, tracker.last_seen)
+                errors = tracker.deformation_errors()
+                check.add(tracked.frame.timestamp, tracker.reference.points, tracker.last_seen, errors)
 
     def _keep_seen(self, tracked: TrackedFrame) -> None:
         """Keep where the points of each object were seen, to refine its reference."""

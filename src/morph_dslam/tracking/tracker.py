@@ -17,6 +17,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
+from morph_dslam.slam.self_calibration import OffByFactors
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
@@ -439,6 +440,14 @@ class Tracker:
     @property
     def state(self) -> State:
         return self._last
+
+    def deformation_errors(self) -> OffByFactors | None:
+        """By how much what the deformation moves points by may be off in the last frame; None where that is unknown."""
+        systematic, errors, mu = self._view.systematic, self._model_errors, self._last.parameters
+        if systematic is None:
+            return None
+        changes, left = (np.zeros((len(mu), 0)), 0.0) if errors is None else errors.in_common(mu)
+        return systematic.deformation_errors(self._last, changes, left)
 
     @property
     def jumps(self) -> tuple[DisplacementJump, ...]:
