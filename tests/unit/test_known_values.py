@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import ArgumentError, TrackingError
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
-from morph_dslam.tracking.known_values import KnownValues
+from morph_dslam.tracking.known_values import KnownValues, registered_with
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
 from tests.support.rendered_sequence import CAMERA, UPRIGHT
@@ -126,3 +127,21 @@ def test_mistakes_of_a_program_are_one_message(values, message):
 def test_what_is_no_number_is_not_known(value):
     with pytest.raises(ArgumentError, match=r"the known 'arch' is .*: give a finite number in SI"):
         Estimator(MODEL, CAMERA).known.tell({"arch": value})
+
+
+def test_a_registration_takes_in_what_is_known_in_its_frame():
+    """The product of two normal distributions has the sum of their informations."""
+    scale = np.array([2e-3, 0.1, 0.02, *[0.01] * 3, *[0.002] * 3])
+    root = scale[:, None] * (np.eye(9) + 0.4 * np.random.default_rng(3).standard_normal((9, 9)))
+    covariance, information = root @ root.T, np.zeros((9, 9))
+    information[2, 2], information[0, 0] = 1.0 / 0.001**2, 1.0 / 0.0005**2
+    known = KnownValues(np.array([2, 0]), {7: np.array([[0.052, 0.001], [0.031, 0.0005]])})
+    found = registered_with(Registration(MODEL, TRUTH, covariance), known, 7)
+    expected = np.linalg.inv(np.linalg.inv(covariance) + information)
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-6, atol=1e-12)
+    step = expected @ information @ [0.001, 0.0, 0.002, *[0.0] * 6]
+    assert found.state.parameters == pytest.approx(TRUTH.parameters + step[:3], rel=1e-9)
+    turn = rotation_log(found.state.camera_from_object.rotation @ POSE.rotation.T)
+    assert turn == pytest.approx(step[3:6], abs=1e-12)
+    assert found.state.camera_from_object.translation == pytest.approx(POSE.translation + step[6:], abs=1e-12)
+    assert registered_with(Registration(MODEL, TRUTH, covariance), known, 8).state is TRUTH

@@ -98,3 +98,20 @@ def test_a_known_parameter_gets_no_deviation(model, certified):
     found = with_model_errors(known, ModelErrors.of(certified)).covariance
     assert found[0, 0] > covariance[0, 0]
     assert not found[1].any()
+
+
+def test_others_make_good_what_a_sensor_keeps_a_parameter_from(model, certified):
+    """The slide is held at a sensor's value; 30 m^-1 of its errors are taken up by the stretch."""
+    stretch, slide = 0.06, 0.004
+    plain, held = tracked_result(model, stretch, slide), np.zeros((8, 2))
+    held[:2, 1] = [-30.0, 1.0]
+    found = with_model_errors(plain, ModelErrors.of(certified), held)
+
+    def size(mu):
+        return np.sqrt(np.mean(np.sum(displacement(model, mu) ** 2, axis=1)))
+
+    errors = (MEANT - STATES) * (size([stretch, slide]) / np.array([size(meant) for meant in MEANT]))[:, None]
+    left = np.column_stack([errors[:, 0] + 30.0 * errors[:, 1], np.zeros(2)])
+    expected = plain.covariance.copy()
+    expected[:2, :2] += left.T @ left / 2.0
+    assert found.covariance == pytest.approx(expected, rel=1e-9)

@@ -124,6 +124,9 @@ def test_the_images_make_no_error_of_the_model_good_in_a_parameter_that_a_sensor
         missed = by_deformation(points, truth) - by_deformation(points, found.state)
         expected = by_deformation(points, truth) - by_deformation(points, LATER)
         assert np.linalg.norm(column - missed) < 0.05 * np.linalg.norm(expected)
+        moved_by = found.state.parameters - LATER.parameters
+        held = errors.held(np.array([0] if is_known else [], dtype=np.int64))[:3] @ change[:, 0]
+        assert moved_by / estimator.scale[:3] == pytest.approx((change[:, 0] - held) / estimator.scale[:3], abs=1e-3)
 
 
 def test_in_the_reference_view_itself_the_error_is_that_of_the_reference(model, estimator, pixels):

@@ -151,18 +151,19 @@ def _with_systematic_errors(
 
 
 def with_model_errors(
-    result: FrameResult, errors: ModelErrors | None, measured: NDArray[np.int64] | None = None
+    result: FrameResult, errors: ModelErrors | None, held: NDArray[np.float64] | None = None
 ) -> FrameResult:
     """The result with the errors of the model's mesh and of its reduction in its deviations.
 
-    They are the same in frames alike, so that they weigh no frame against another: only results have them. Known
-    parameters do not get any.
+    They are the same in frames alike, so that they weigh no frame against another: only results have them. A parameter
+    that a sensor tells makes them good by the images' share in it, and the other unknowns by what it leaves.
 
     Parameters
     ----------
     result : of a frame.
     errors : of its model; None where none are known.
-    measured : indices of the parameters that something else than the images tells of.
+    held : (d + 6, d) the change of the unknowns that something else than the images keeps from them, for each change of
+        the parameters; None where the images alone tell.
     """
     estimate = result.estimate
     if errors is None or estimate is None:
@@ -170,10 +171,11 @@ def with_model_errors(
     mu, covariance = estimate.state.parameters, estimate.covariance.copy()
     d, by_model = len(mu), errors.at(mu)
     sought = np.diag(covariance)[:d] > 0.0
-    if measured is not None:
-        sought[measured] = False
     by_model = replace(by_model, parameters=np.outer(sought, sought) * by_model.parameters)
-    covariance[:d, :d] += by_model.parameters
+    made_good = np.eye(d + 6, d) if held is None else np.eye(d + 6, d) - held
+    added = made_good @ by_model.parameters @ made_good.T
+    by_model = replace(by_model, parameters=added[:d, :d])
+    covariance += added
     return replace(result, estimate=replace(estimate, covariance=covariance, by_model=by_model))
 
 

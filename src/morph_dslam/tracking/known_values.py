@@ -19,9 +19,11 @@ from morph_dslam.errors import ArgumentError, TrackingError, check_kind
 from morph_dslam.io.text import has_a_cell_for_each, read_csv
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.outcomes import TimeOutside
+from morph_dslam.tracking.state import moved
 
 Array = NDArray[np.float64]
 FRAME, STD = "frame", "_std_"
@@ -160,6 +162,32 @@ def with_usual_deviations(model: ReducedModel, indices: NDArray[np.int64], value
     usual = USUAL_STD * (model.upper - model.lower)[indices]
     found[:, 1] = np.where(np.isnan(values[:, 1]), usual, values[:, 1])
     return found
+
+
+def registered_with(registration: Registration, known: KnownValues, frame: int) -> Registration:
+    """The registration with what is known of parameters in its frame, to first order.
+
+    What it is off by stays in all frames, by the places of the points on the mesh: where a sensor tells the shape
+    better, later estimates of the same parameters would be worse than the sensor's.
+
+    Parameters
+    ----------
+    registration : itself is returned where its covariance is not known.
+    known : of a recording.
+    frame : number of the reference frame in it.
+    """
+    covariance, values = registration.covariance, known.by_frame.get(frame)
+    if covariance is None or values is None or not np.isfinite(covariance).all():
+        return registration
+    there = np.isfinite(values[:, 0])
+    rows, (told, deviations) = known.indices[there], values[there].T
+    state, model = registration.state, registration.model
+    gain = np.linalg.solve(covariance[np.ix_(rows, rows)] + np.diag(deviations**2), covariance[rows]).T
+    step = gain @ (told - state.parameters[rows])
+    found = moved(state, step)
+    found = replace(found, parameters=np.clip(found.parameters, model.lower, model.upper))
+    left = covariance - gain @ covariance[rows]
+    return replace(registration, state=found, covariance=0.5 * (left + left.T))
 
 
 class KnownParameters:

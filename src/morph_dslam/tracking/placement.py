@@ -23,6 +23,7 @@ from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.known_time import KnownTime
+from morph_dslam.tracking.known_values import registered_with
 from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
 from morph_dslam.tracking.occlusion import drawn_depth
 from morph_dslam.tracking.options import TrackerOptions
@@ -131,10 +132,13 @@ class PlacedObject:
                 seen=seen,
                 keyframes=self.keyframes,
             )
+        registration, told = self.registration, self.object.known
+        if told is not None and self.in_sequence:
+            registration = registered_with(registration, told, self.frame)
         tracker = Tracker(
             self.model,
             self.camera,
-            self.registration,
+            registration,
             self.options,
             reference=self.images[0],
             in_sequence=self.in_sequence,

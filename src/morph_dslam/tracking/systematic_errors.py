@@ -368,6 +368,15 @@ class SystematicErrors:
         share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain)
         return np.asarray(gain @ (common_px / np.sqrt(share) * gradients.T), dtype=np.float64)
 
+    def held(self, measured: NDArray[np.int64]) -> Array:
+        """What sensors keep from the last frame's estimate (d + 6, d), for each change of the parameters.
+
+        ``measured`` : indices of the parameters that they tell.
+        """
+        found = np.zeros((len(self._by_known), len(self._by_known) - 6))
+        found[:, measured] = self._by_known[:, measured]
+        return found
+
     def deformation_errors(self, state: State, changes: Array, left: float) -> Callable[[], Array]:
         """By how much what the deformation moves the pixels by (p, 2, c) may be off in the last frame that was kept.
 

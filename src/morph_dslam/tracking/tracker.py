@@ -218,8 +218,10 @@ class Tracker:
                 hypothesis = self._refine(image, hypothesis, camera)
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
+            systematic, measured = self._view.systematic, self.estimator.known.indices
+            held = None if systematic is None or not len(measured) else systematic.held(measured)
             change = self._choose_view(image, hypothesis, result)
-            result = with_model_errors(result, self._model_errors, self.estimator.known.indices)
+            result = with_model_errors(result, self._model_errors, held)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
