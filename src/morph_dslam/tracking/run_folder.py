@@ -300,8 +300,12 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
     return summary
 
 
+#: A force is at least its length less so many standard deviations.
+CERTAIN = 2.0
+
+
 def largest_forces(run: RunResults) -> list[dict[str, Any]]:
-    """Of each support its largest force, with standard deviation and frame; the largest of them first.
+    """Of each support the force that is largest for certain, its standard deviation and frame; the largest one first.
 
     The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
     the reduction, and where it was estimated of the discretisation too.
@@ -310,7 +314,11 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     for name, frames in run.reactions().items():
         known = [(reaction, frame) for reaction, frame in zip(frames, run.frames, strict=True) if reaction is not None]
         if known:
-            largest, frame = max(((reaction.force, frame) for reaction, frame in known), key=lambda one: one[0].size)
+            # A length that consists of what is not determined is no force.
+            largest, frame = max(
+                ((reaction.force, frame) for reaction, frame in known),
+                key=lambda one: (one[0].size - CERTAIN * one[0].size_std, one[0].size),
+            )
             figures = {"on": name, "force_N": largest.size, "standard_deviation_N": largest.size_std, "frame": frame}
             figures["not_counted"] = uncounted(run.model)
             error = force_error(run.model, name)
