@@ -486,3 +486,10 @@ def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest
     assert (tmp_path / "out" / "identification.png").stat().st_size > 1000
     assert cli.main([*command, "-o", str(tmp_path / "out")]) == 2
     assert "give one --reaction" in capsys.readouterr().err
+    (tmp_path / "out" / "identification.json").write_text("earlier")
+    again = [*command, "--reaction", "edge:z", "-o", str(tmp_path / "out")]
+    assert cli.main(again) == 2
+    assert "holds an identification already" in capsys.readouterr().err
+    assert (tmp_path / "out" / "identification.json").read_text() == "earlier"
+    assert cli.main([*again, "--overwrite"]) == 0
+    assert (tmp_path / "out" / "identification.json").read_text() != "earlier"

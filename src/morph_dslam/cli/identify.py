@@ -42,6 +42,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="RUN",
         help="run folder of the video: its frames, and its estimates of per-sequence parameters",
     )
+    add_flag(command, "--overwrite", "replace an identification that is in the folder")
     add_output(command, "OUT", "folder to write")
 
 
@@ -60,6 +61,11 @@ def run(arguments: argparse.Namespace) -> None:
 
     if len(arguments.reaction) != len(arguments.force):
         raise IdentificationError("give one --reaction SET:AXIS for each --force, in the same order")
+    if (arguments.output / "identification.json").exists() and not arguments.overwrite:
+        raise IdentificationError(
+            f"{arguments.output} holds an identification already: choose another folder, or allow it to be overwritten "
+            "(`--overwrite`)"
+        )
     model = load_model(arguments.model)
     folder: Path | None = arguments.run_folder
     tracked = None if folder is None else load_run(folder)
