@@ -156,6 +156,47 @@ def test_the_first_message_of_a_topic_is_read(tmp_path):
     assert load_camera(path).fx == 300.0
 
 
+ROI = "roi: {x_offset: %d, y_offset: %d, height: %d, width: %d, do_rectify: false}\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "left", "top", "size", "by"),
+    [
+        ("binning_x: 0\nbinning_y: 0\n" + ROI % (0, 0, 0, 0), 0, 0, (640, 480), 1),
+        ("binning_x: 1\nbinning_y: 1\n" + ROI % (0, 0, 480, 640), 0, 0, (640, 480), 1),
+        (ROI % (60, 40, 280, 360), 60, 40, (360, 280), 1),
+        ("binning_x: 2\nbinning_y: 2\n", 0, 0, (320, 240), 2),
+        ("binning_x: 4\nbinning_y: 4\n" + ROI % (60, 40, 280, 360), 60, 40, (90, 70), 4),
+    ],
+)
+def test_what_ros_read_out_of_a_sensor(tmp_path, lines, left, top, size, by):
+    path = tmp_path / "camera_info.yaml"
+    path.write_text(ROS + lines)
+    camera = load_camera(path)
+    assert (camera.width, camera.height) == size
+    assert camera.distortion == BROWN
+    # Pictures whose values are where each pixel was in the full image, cut and merged as a sensor does.
+    full = Camera(640, 480, 458.654, 457.296, 367.215, 248.375, BROWN)
+    where = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), axis=-1)
+    read = where[top : top + size[1] * by, left : left + size[0] * by]
+    read = cv2.resize(read, size, interpolation=cv2.INTER_AREA)
+    points = np.array([[0.0, 0.0, 1.0], [-0.2, 0.1, 1.0], [-0.3, -0.2, 1.1]])
+    pixels = camera.project_recorded(points).astype(np.float32)
+    found = cv2.remap(read, pixels[None, :, 0], pixels[None, :, 1], cv2.INTER_LINEAR)[0]
+    np.testing.assert_allclose(found, full.project_recorded(points), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [ROI % (400, 0, 480, 360), ROI % (60, 40, 0, 0), ROI % (-1, 0, 9, 9), "binning_x: 0.5\n", "binning_y: 481\n"],
+)
+def test_what_no_sensor_reads_out_is_refused(tmp_path, lines):
+    path = tmp_path / "camera_info.yaml"
+    path.write_text(ROS + lines)
+    with pytest.raises(CameraError, match=r"camera_info\.yaml: roi .* of 640x480, the full size: correct them"):
+        load_camera(path)
+
+
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 
 

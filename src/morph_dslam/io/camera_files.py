@@ -311,7 +311,40 @@ def _from_opencv_or_ros(content: Mapping, where: str) -> Mapping:
         width, height = _numbers(content["image_size"], 2, f"{where}: image_size")
     _check_size(width, height, where, "image_width: and image_height:")
     intrinsics = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
-    return {"width": width, "height": height, **intrinsics, **_lens_keys(model, coefficients, where)}
+    full = {"width": width, "height": height, **intrinsics}
+    return _of_read_out(full, content, where) | _lens_keys(model, coefficients, where)
+
+
+def _of_read_out(full: Mapping, content: Mapping, where: str) -> Mapping:
+    """The intrinsics of the pixels that a camera_info says were read out, from those of the full image.
+
+    ROS keeps size and matrix those of the full resolution where the camera cut its images (``roi``) or merged pixels
+    (``binning_x``, ``binning_y``). Binning by 0 is none, and a region of zeros is the full image.
+    """
+    roi = content.get("roi") or {}
+    if not isinstance(roi, dict):
+        raise CameraError(f"{where}: roi is not x_offset, y_offset, height and width")
+    keys = ("x_offset", "y_offset", "width", "height")
+    region = np.array(_numbers([roi.get(key, 0) for key in keys], 4, f"{where}: roi"))
+    binning = np.array(_numbers([content.get(f"binning_{axis}", 0) for axis in "xy"], 2, f"{where}: binning"))
+    if not region.any() and np.isin(binning, (0.0, 1.0)).all():
+        return full
+    size = np.array(_numbers([full["width"], full["height"]], 2, f"{where}: image size"))
+    offset, kept = (region[:2], region[2:]) if region.any() else (np.zeros(2), size)
+    numbers, binning = np.concatenate([region, binning, size]), np.maximum(binning, 1.0)
+    are_counts = bool((np.isfinite(numbers) & (numbers >= 0.0) & (numbers == np.floor(numbers))).all())
+    if not are_counts or (kept < binning).any() or (offset + kept > size).any():
+        given = [", ".join(f"{number:g}" for number in numbers) for numbers in (region, binning)]
+        raise CameraError(
+            f"{where}: roi with x_offset, y_offset, width, height = {given[0]} and binning {given[1]} leave no whole "
+            f"pixels of an image of {size[0]:g}x{size[1]:g}, the full size: correct them, or take them out of the file "
+            "for full images"
+        )
+    (width, height), focal = kept // binning, np.array([full["fx"], full["fy"]]) / binning
+    # The centre of the first merged pixel is in the middle of those it was merged from.
+    centre = (np.array([full["cx"], full["cy"]]) - offset + 0.5) / binning - 0.5
+    values = (int(width), int(height), *focal.tolist(), *centre.tolist())
+    return dict(zip(("width", "height", "fx", "fy", "cx", "cy"), values, strict=True))
 
 
 def _from_orb_slam(content: Mapping, where: str) -> Mapping:
