@@ -127,6 +127,23 @@ def test_a_camera_that_only_turns_waits_and_says_why():
     assert frames[-1].reason == NoPose(SlamReason.ONLY_TURNED)
 
 
+def test_the_command_ends_with_the_reason_where_no_frame_has_a_pose(tmp_path, capsys):
+    film = RoomFilm(seed=3)
+    write_film(tmp_path, [film.frame(pose((0.0, 0.0, 0.0), (0.0, 0.01 * i, 0.0))) for i in range(6)])
+    command = ["slam", str(tmp_path / "film"), "--camera", str(tmp_path / "camera.yaml"), "-o", str(tmp_path / "run")]
+    assert main([*command, "--no-video"]) == 2
+    said = capsys.readouterr()
+    assert "no map was begun" not in said.out
+    assert "tracked=0/6" in said.out
+    last = said.err.splitlines()[-1]
+    assert last.startswith("morph: no map was begun: not enough parallax: ")
+    assert str(tmp_path / "run" / "frames.csv") in last
+    # What came of each frame is kept.
+    with (tmp_path / "run" / "frames.csv").open() as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["waiting"] * 6
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["n_tracked"] == 0
+
+
 def test_a_film_that_starts_no_map_ends_with_a_rolling_shutter_too():
     film = RoomFilm(seed=3)
     still = [film.frame(pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))] * 3

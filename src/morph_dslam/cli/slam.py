@@ -11,6 +11,7 @@ from morph_dslam.cli.arguments import (
     add_rate,
     frame_number,
 )
+from morph_dslam.errors import MapError
 
 HELP = "find the path of a camera through a rigid scene, and a map of the scene"
 TERMS = ("focal", "centre", "radial", "tangential", "readout")
@@ -67,7 +68,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Map the scene and print the figures."""
+    """Map the scene and print the figures.
+
+    Raises
+    ------
+    MorphError
+        As `run_slam`; MapError if no frame has a pose, once the run folder is complete.
+    """
     from morph_dslam import SlamOptions
     from morph_dslam.extend.slam import run_slam
 
@@ -93,10 +100,13 @@ def run(arguments: argparse.Namespace) -> None:
     )
     for term, found in summary.get("refined_camera", {}).items():
         given, values, std = (", ".join(f"{v:.4g}" for v in found[key]) for key in ("given", "estimated", "std"))
-        why = "not refuted" if found["is_observable"] else "unobservable here"
-        kept = f"; {why}, kept as given" if found["is_kept"] else ""
+        shown = "not refuted" if found["is_observable"] else "unobservable here"
+        kept = f"; {shown}, kept as given" if found["is_kept"] else ""
         print(f"{term}: {values} (standard deviation {std}), was {given}{kept}")
+    why = summary["why_without_poses"]
     for flag in summary["flags"]:
+        if flag == why:  # it is said last, as the error
+            continue
         print(f"note: {flag}")
     print(f"wrote {arguments.output}")
     depth = "" if summary["median_depth_m"] is None else f" median_depth_m={summary['median_depth_m']:.3g}"
@@ -104,3 +114,5 @@ def run(arguments: argparse.Namespace) -> None:
         f"start={summary['start_frame']} tracked={summary['n_tracked']}/{summary['n_frames']} "
         f"median_ms={summary['median_ms']:.2f} p95_ms={summary['p95_ms']:.2f}{depth}"
     )
+    if why is not None:
+        raise MapError(f"{why}; {arguments.output / 'frames.csv'} has the reason of each frame")

@@ -36,15 +36,22 @@ def run_notes(slam: Slam, frames: Sequence[SlamFrame], after: Sequence[SlamFrame
     if slam.n_restarts:
         n = slam.n_restarts
         yield f"{_counted(n, 'young map')} {_were(n)} lost for too long and given up, with {_its(n)} poses"
-    if frames and not after:
-        what = "the camera was found in no frame of this map" if slam.knows_map else "no map was begun"
-        yield f"{what}: {frames[-1].reason}{_depth_advice(frames[-1].reason)}"
+    if (why := why_without_poses(slam, frames, after)) is not None:
+        yield why
     if slam.n_depths_aside:
         yield (
             f"{_counted(slam.n_depths_aside, 'depth image')} not registered to the colour {_were(slam.n_depths_aside)} "
             "not used: docs/sources.md says how to register depth"
         )
     yield from time_notes(frames, slam.camera.readout_s)
+
+
+def why_without_poses(slam: Slam, frames: Sequence[SlamFrame], after: Sequence[SlamFrame]) -> str | None:
+    """Why no frame has a pose; None where one has. Parameters as of `run_notes`."""
+    if after or not frames:
+        return None
+    what = "the camera was found in no frame of this map" if slam.knows_map else "no map was begun"
+    return f"{what}: {frames[-1].reason}{_depth_advice(frames[-1].reason)}"
 
 
 def time_notes(frames: Sequence[SlamFrame], readout_s: float = 0.0) -> Iterator[str]:

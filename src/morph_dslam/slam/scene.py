@@ -31,7 +31,7 @@ from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
-from morph_dslam.slam.run_notes import run_notes
+from morph_dslam.slam.run_notes import run_notes, why_without_poses
 from morph_dslam.slam.second_pass import find_rest
 from morph_dslam.slam.self_calibration import (
     CHECKED,
@@ -383,6 +383,7 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
         "longest_wait_for_mapper_ms": float(np.max(waits)),
         "p99_wait_for_mapper_ms": float(np.percentile(waits, 99)),
         "settings": asdict(slam.options),
+        "why_without_poses": why_without_poses(slam, scene.frames, after),
         "flags": [*run_notes(slam, scene.frames, after), *scene.camera_notes],
     }
 
