@@ -1,5 +1,6 @@
 """Maps that another program made: COLMAP models, and trajectories from which only points are missing."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -14,7 +15,7 @@ from morph_dslam.io.colmap import ColmapImage, read_colmap_model, write_colmap_m
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import NoPose, SlamReason, SlamStatus
-from morph_dslam.slam.scene import load_scene, map_scene, start_slam
+from morph_dslam.slam.scene import Scene, load_scene, map_scene, start_slam
 from tests.support.rendered_room import (
     CAMERA,
     PERIOD,
@@ -27,6 +28,7 @@ from tests.support.rendered_room import (
     write_film,
 )
 
+NO_PATH = Trajectory(np.empty(0), np.empty((0, 4, 4)))
 #: Another program's world and unit.
 WORLD, UNIT = pose((3.0, -1.0, 2.0), (0.4, -0.2, 0.9)), 2.5
 
@@ -117,6 +119,32 @@ def test_the_camera_of_a_known_map_is_not_checked_and_one_that_is_elsewhere_is_t
     film = Film([elsewhere.frame(place) for place in hand_held(3, seed=8)])
     (flag,) = map_scene(film, CAMERA, known=known).summary()["flags"]
     assert flag.startswith("the camera was found in no frame of this map: ")
+
+
+def through_a_lens(pictures, distortion):
+    """Pictures as recorded through a lens, by OpenCV's undistortion of each recorded pixel."""
+    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), axis=-1).reshape(-1, 1, 2)
+    ideal = cv2.undistortPoints(pixels, CAMERA.matrix, np.array(distortion), P=CAMERA.matrix)
+    x, y = ideal.reshape(480, 640, 2).astype(np.float32).transpose(2, 0, 1)
+    return [cv2.remap(picture, x, y, cv2.INTER_LINEAR) for picture in pictures]
+
+
+def test_a_lens_that_does_not_fit_the_recording_is_named_in_a_known_map(room, colmap):
+    k1, k2 = -0.25, 0.07
+    pictures = through_a_lens(room[1], (k1, k2, 0.0, 0.0))
+    model, undistorted = read_colmap_model(colmap), Film(room[1])
+    (flag,) = map_scene(Film(pictures), CAMERA, known=model, images=undistorted).summary()["flags"]
+    numbers = [float(number) for number in re.findall(r"-?\d+\.\d{4}", flag)]
+    given, (estimated, two_std) = numbers[:2], numbers[2:4]
+    assert given == [0.0, 0.0]
+    assert estimated == pytest.approx(k1, abs=0.02)
+    assert two_std < 0.02
+    # The same pictures with their lens fit the same map.
+    slam = start_slam(undistorted, CAMERA, SlamOptions(), model, undistorted)
+    camera, known = replace(CAMERA, distortion=(k1, k2, 0.0, 0.0)), Scene(CAMERA, slam.map, NO_PATH)
+    right = map_scene(Film(pictures[20:], first=20), camera, known=known)
+    assert len(right.trajectory) == 20
+    assert right.summary()["flags"] == []
 
 
 def test_what_does_not_fit_is_refused(room, poses, colmap):

@@ -41,6 +41,21 @@ def camera_notes(estimate: CameraEstimate, deforms: bool = False) -> Iterator[st
         )
 
 
+def known_map_notes(estimate: CameraEstimate) -> Iterator[str]:
+    """What a reader of a run in a known map must know of its lens, which alone was estimated.
+
+    Intrinsics are those of the map, and what deforms in a map that is kept looks like another focal length or readout
+    time.
+    """
+    lens = estimate.terms.get("radial")
+    if lens is not None and lens.is_wrong and lens.is_observable:
+        yield (
+            f"the camera file does not fit this recording: {_NAMES['radial']} {_described('radial', lens)}. "
+            "Positions are wrong by more than they state. Give the camera of this recording, or the pictures of this "
+            "camera: undistorted ones where it has no distortion, as that of a COLMAP model"
+        )
+
+
 _NAMES: dict[CameraTerm, str] = {
     "focal": "focal length",
     "centre": "principal point",

@@ -21,7 +21,7 @@ from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
-from morph_dslam.slam.camera_notes import camera_notes
+from morph_dslam.slam.camera_notes import camera_notes, known_map_notes
 from morph_dslam.slam.depth_scale import check_depth_ratio
 from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.local_map import correct_map
@@ -108,7 +108,11 @@ class Scene:
         Where too few frames or points tell of it, all terms are unobservable. None without a path, in a map that was
         known before, and of a stereo pair.
         """
-        if self.slam is None or self.slam.knows_map or self.slam.frame_images.is_stereo or not len(self.trajectory):
+        return None if self.slam is None or self.slam.knows_map else self._estimate(terms)
+
+    def _estimate(self, terms: Sequence[CameraTerm]) -> CameraEstimate | None:
+        """The camera as the recording shows it, in a map that was known before too."""
+        if self.slam is None or self.slam.frame_images.is_stereo or not len(self.trajectory):
             return None
         key = tuple(terms)
         if key not in self._estimates:
@@ -125,6 +129,8 @@ class Scene:
             return notes
         if self.slam.knows_map and not len(self.trajectory):
             notes = ()  # of another recording, and perhaps of another camera
+        elif self.slam.knows_map and (found := self._estimate(("radial",))) is not None:
+            notes = (*known_map_notes(found), *notes)
         doubts = () if self.slam.frame_images.is_stereo else camera_doubts(self.camera)
         return tuple(dict.fromkeys((*doubts, *notes)))
 
@@ -285,7 +291,8 @@ def trajectory_of(slam: Slam, frames: Sequence[SlamFrame]) -> Trajectory:
 def _seen(slam: Slam, frames: Sequence[SlamFrame], path: Trajectory) -> list[Followed]:
     """The map points that the frames of a path saw, keyframes as the map has them: that is more exact."""
     # Keyframes of a known map have numbers of another recording.
-    by_index = {frame.index: frame.points for frame in frames} | slam.map.seen_in_keyframes(slam.n_known)
+    by_index = {frame.index: frame.points for frame in frames} | slam.seen_in_known_map
+    by_index |= slam.map.seen_in_keyframes(slam.n_known)
     return [slam.map.good_of(by_index[index]) for index in path.indices.tolist()]
 
 

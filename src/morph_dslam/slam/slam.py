@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 HELD_FRAMES = 3
 #: The scene deforms when more than this share of its points disagree with a rigid one in so many frames on end.
 DEFORMING_SHARE, DEFORMING_FRAMES = 0.12, 5
+#: Frames whose points are kept for the check of the lens in a known map: two minutes of video, in some 30 MB.
+MOST_FRAMES_SEEN = 3600
 
 
 class Slam:
@@ -61,6 +63,8 @@ class Slam:
     n_known : keyframes of a map that was known before
     n_depths_aside : depth images that were not used because they do not belong to the colour pixels
     depth_ratio : measured depths over those of a map that was known before, once a frame told; None before
+    seen_in_known_map : points of the first frames in a map that was known before and is kept, by the frames' numbers:
+        records of such frames have none, and the lens is checked by them
     """
 
     def __init__(
@@ -78,6 +82,7 @@ class Slam:
         self.n_restarts, self.threaded = 0, threaded
         self.n_known, self.n_depths_aside = 0, 0
         self.depth_ratio: float | None = None
+        self.seen_in_known_map: dict[int, Followed] = {}
         self._expects_depth = with_depth or self.frame_images.is_stereo or not self.options.use_depth
         self._begin(RigidMap(self.frame_images.baseline_px))
 
@@ -125,6 +130,7 @@ class Slam:
 
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k = rigid_map, self.camera.intrinsics
+        self.seen_in_known_map = {}  # of another map, their points are others
         self._initializer = MapInitializer(k)
         self._tracker = Tracker(self.map, self.camera)
         self._making = MapMaking(self.map, self.camera, self._tracker, self.threaded)
@@ -166,6 +172,8 @@ class Slam:
             frame = self._locate(view)
             if self.knows_map and self.depth_ratio is None:
                 self.depth_ratio = self._compared_depth(view, frame)
+            if self.knows_map and self.is_frozen and len(self.seen_in_known_map) < MOST_FRAMES_SEEN:
+                self.seen_in_known_map[index] = frame.points.without_unmeasured()
             if not self.is_frozen:
                 self._making.end_frame()
             self._n_lost = self._n_lost + 1 if frame.status is SlamStatus.LOST else 0
