@@ -277,5 +277,5 @@ def test_tables_given_twice_and_too_short_ones_are_refused(tmp_path: Path, capsy
     assert "3 forces in column 'force_N': give at least 4" in capsys.readouterr().err
     curve.write_text("a_mm,force_N\n100,10\n200,20\n300,30\n400,40\n")
     assert cli.main([*asked, *once, "--no-offset"]) == 0
-    assert cli.main([*asked, *once, "--force", f"{curve}:force_N", "--reaction", "edge:x"]) == 2
+    assert cli.main([*asked, *once, "--force", f"{curve}:force_N", "--reaction", "edge:x", "--overwrite"]) == 2
     assert "is given twice" in capsys.readouterr().err

@@ -72,6 +72,8 @@ class MapMaking:
 
     def wants_keyframe(self, tracked: Tracked, frame_index: int) -> bool:
         """Whether the map should keep a view, and can."""
+        if self._threaded and not self.can_keep:
+            return False  # the draft, which this looks at, is being changed beside the frames
         wants = self._mapper.wants_keyframe(tracked, frame_index)
         self._is_waited_for = wants and not self.can_keep
         return wants and self.can_keep
