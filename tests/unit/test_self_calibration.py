@@ -11,10 +11,11 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.camera_notes import camera_notes
+from morph_dslam.slam.camera_terms import TERMS, CameraEstimate, TermEstimate, with_terms_of
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.rolling_shutter import MiddleRowPoses, correct_path
 from morph_dslam.slam.scene import refine_camera
-from morph_dslam.slam.self_calibration import TERMS, CameraEstimate, TermEstimate, estimate_camera, with_terms_of
+from morph_dslam.slam.self_calibration import estimate_camera
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 LENS = (-0.28, 0.07, 0.0, 0.0)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, TermEstimate
+from morph_dslam.slam.camera_terms import CameraEstimate, CameraTerm, TermEstimate
 
 
 def camera_notes(estimate: CameraEstimate, deforms: bool = False) -> Iterator[str]:

@@ -24,12 +24,12 @@ from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, w
 from morph_dslam.io.folders import make_run_folder, only_writer
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.slam.camera_terms import CameraEstimate, CameraTerm, with_terms_of
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import STAGES, SlamFrame
 from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camera, start_slam, track_frames
-from morph_dslam.slam.self_calibration import CameraEstimate, CameraTerm, with_terms_of
 from morph_dslam.sources import FrameSource, open_source, open_stream
 from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream

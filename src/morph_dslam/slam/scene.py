@@ -22,6 +22,15 @@ from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.camera_notes import camera_notes, known_map_notes
+from morph_dslam.slam.camera_terms import (
+    CHECKED,
+    TERMS,
+    CameraEstimate,
+    CameraTerm,
+    TermEstimate,
+    terms_of,
+    with_terms_of,
+)
 from morph_dslam.slam.depth_scale import check_depth_ratio
 from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.local_map import correct_map
@@ -33,16 +42,7 @@ from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
 from morph_dslam.slam.run_notes import run_notes, why_without_poses
 from morph_dslam.slam.second_pass import find_rest
-from morph_dslam.slam.self_calibration import (
-    CHECKED,
-    TERMS,
-    CameraEstimate,
-    CameraTerm,
-    TermEstimate,
-    estimate_camera,
-    terms_of,
-    with_terms_of,
-)
+from morph_dslam.slam.self_calibration import estimate_camera
 from morph_dslam.slam.slam import Slam
 from morph_dslam.slam.templates import Templates, image_pyramid
 from morph_dslam.slam.tracking import similar_views

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam.camera_terms import TERMS, CameraEstimate, CameraTerm
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
-from morph_dslam.slam.self_calibration import TERMS, CameraEstimate, CameraTerm, OffByFactors, estimate_camera
+from morph_dslam.slam.self_calibration import OffByFactors, estimate_camera
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.state import BoundPoints
 
