@@ -101,7 +101,7 @@ def test_what_the_deformation_moves_points_by_is_off_as_predicted(model, estimat
         found = estimator.estimate(points, seen, np.ones(len(pixels)), LATER)
         errors = errors_of(estimator, points, off, np.outer(step, step))
         errors.added(found, used, 0.0)
-        columns = errors.deformation_errors(found.state, np.zeros((3, 0)), 0.0)()
+        columns = errors.deformation_errors(found.state, None)()
         wrong = by_deformation(points, found.state) - by_deformation(true_points, LATER)
         predicted = columns.sum(axis=2)
         predicted *= np.sign(np.sum(predicted * wrong))
@@ -120,7 +120,7 @@ def test_the_images_make_no_error_of_the_model_good_in_a_parameter_that_a_sensor
         found = estimator.estimate(points, seen, np.ones(len(pixels)), LATER)
         errors = errors_of(estimator, points, REFERENCE, np.zeros((9, 9)))
         errors.added(found, used, 0.0)
-        column = errors.deformation_errors(found.state, change, 0.0)()[:, :, 9]
+        column = errors.deformation_errors(found.state, lambda mu: (change, 0.0))()[:, :, 9]
         missed = by_deformation(points, truth) - by_deformation(points, found.state)
         expected = by_deformation(points, truth) - by_deformation(points, LATER)
         assert np.linalg.norm(column - missed) < 0.05 * np.linalg.norm(expected)

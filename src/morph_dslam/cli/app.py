@@ -27,6 +27,8 @@ USER_ERROR = 2
 INTERRUPTED = 130
 #: Whoever read the output has stopped, `morph info sheet.morph | head` say: as a shell reports SIGPIPE.
 OUTPUT_CLOSED = 141
+#: How often a progress bar is written into a file or a pipe, seconds. tqdm reads the variable when it is loaded.
+LOGGED_EVERY = ("TQDM_MININTERVAL", "10")
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -90,10 +92,6 @@ def run_and_report_errors(
         print(f"\nmorph: interrupted; {interrupt if interrupt.args else kept}", file=sys.stderr)
         return INTERRUPTED
     return 0
-
-
-#: How often a progress bar is written into a file or a pipe, seconds. tqdm reads the variable when it is loaded.
-LOGGED_EVERY = ("TQDM_MININTERVAL", "10")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

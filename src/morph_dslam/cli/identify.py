@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_repeated, file_and_column
 from morph_dslam.errors import IdentificationError
+from morph_dslam.io.folders import check_free
 
 if TYPE_CHECKING:
     from morph_dslam import ReducedModel, Run
@@ -61,11 +62,8 @@ def run(arguments: argparse.Namespace) -> None:
 
     if len(arguments.reaction) != len(arguments.force):
         raise IdentificationError("give one --reaction SET:AXIS for each --force, in the same order")
-    if (arguments.output / "identification.json").exists() and not arguments.overwrite:
-        raise IdentificationError(
-            f"{arguments.output} holds an identification already: choose another folder, or allow it to be overwritten "
-            "(`--overwrite`)"
-        )
+    sign = arguments.output / "identification.json"
+    check_free(sign, "an identification", arguments.overwrite, IdentificationError)
     model = load_model(arguments.model)
     folder: Path | None = arguments.run_folder
     tracked = None if folder is None else load_run(folder)

@@ -8,10 +8,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from morph_dslam.errors import TrackingError
+from morph_dslam.errors import MorphError, TrackingError
 
 if sys.platform != "win32":
     import fcntl
+
+
+def check_free(sign: Path, held: str, overwrite: bool, kind: type[MorphError]) -> None:
+    """Raise an error of a kind if a folder holds an earlier result that is not to be overwritten.
+
+    Parameters
+    ----------
+    sign : the file in the folder by which such a result is known.
+    held : what it is, "a run" say.
+    overwrite : whether the folder may hold it.
+    """
+    if sign.exists() and not overwrite:
+        raise kind(
+            f"{sign.parent} holds {held} already: choose another folder, or allow it to be overwritten (`--overwrite`)"
+        )
 
 
 def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> None:
@@ -28,10 +43,7 @@ def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> N
     TrackingError
         If it cannot be made, or holds a run already that is not to be overwritten.
     """
-    if (folder / sign).exists() and not overwrite:
-        raise TrackingError(
-            f"{folder} holds a run already: choose another folder, or allow it to be overwritten (`--overwrite`)"
-        )
+    check_free(folder / sign, "a run", overwrite, TrackingError)
     _make(folder)
     # They would stand in the report of the new run.
     for old in folder.glob("*evaluation.json"):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera
+from morph_dslam.io.folders import check_free
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
@@ -290,11 +291,7 @@ def run_registration(
     hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region, "guess": guess}
     if board is not None and (beside or any(hint is not None for hint in hints.values())):
         raise RegistrationError("a board says where the object is: leave out --beside and the hints")
-    if (output / "registration.json").exists() and not overwrite:
-        raise RegistrationError(
-            f"{output} holds a registration already: choose another folder, or allow it to be overwritten "
-            "(`--overwrite`)"
-        )
+    check_free(output / "registration.json", "a registration", overwrite, RegistrationError)
     camera, model = load_camera(camera_path), load_model(model_path)
     others = [_load_beside(path, map_path) for path in beside]
     scene = load_scene(map_path, camera)

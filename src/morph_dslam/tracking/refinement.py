@@ -120,9 +120,12 @@ def refine_reference(
     d = len(model.parameters)
     half_ranges = 0.5 * (model.upper - model.lower)
     scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+    free = np.r_[: d - model.n_loads, d : d + 6]
 
     def reference(step: Array) -> State:
-        state = moved(start, step * scale)
+        whole = np.zeros(d + 6)
+        whole[free] = step
+        state = moved(start, whole * scale)
         return replace(state, parameters=np.clip(state.parameters, model.lower, model.upper))
 
     def residuals(step: Array) -> Array:
@@ -137,24 +140,17 @@ def refine_reference(
     bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
     bounds[0, :d] = (model.lower - start.parameters) / scale[:d] - 1e-6
     bounds[1, :d] = (model.upper - start.parameters) / scale[:d] + 1e-6
-    free = np.r_[: d - model.n_loads, d : d + 6]
-
-    def whole(step: Array) -> Array:
-        result = np.zeros(d + 6)
-        result[free] = step
-        return result
-
-    found = minimum(lambda step: residuals(whole(step)), np.zeros(len(free)), (bounds[0, free], bounds[1, free]), 10)
+    found = minimum(residuals, np.zeros(len(free)), (bounds[0, free], bounds[1, free]), 10)
     n_known, n_points = len(known.residuals(camera, start)), len(reference_pixels)
-    jacobian = _without_points_that_come_and_go(lambda step: residuals(whole(step)), found, n_known)
+    jacobian = _derivatives(residuals, found.x, n_known)
     rows = np.split(jacobian[n_known:], np.cumsum(_sizes(keyframes, n_points))[:-1]) if keyframes else []
     covariance = np.zeros((d + 6, d + 6))
     covariance[np.ix_(free, free)] = _covariance(jacobian[:n_known], rows, 2 * n_points)
-    return reference(whole(found.x)), covariance * np.outer(scale, scale)
+    return reference(found.x), covariance * np.outer(scale, scale)
 
 
-def _without_points_that_come_and_go(residuals: Callable[[Array], Array], found: OptimizeResult, n_known: int) -> Array:
-    """Derivatives (r, k) at the minimum, zero of points that do not meet the surface a step beside it.
+def _derivatives(residuals: Callable[[Array], Array], at: Array, n_known: int) -> Array:
+    """Derivatives (r, k) at some unknowns (k,), zero of points that do not meet the surface a step beside it.
 
     The residual of such a point is zero: its jump over a short step is no derivative.
 
@@ -162,8 +158,8 @@ def _without_points_that_come_and_go(residuals: Callable[[Array], Array], found:
     ----------
     n_known : the first residuals, which are of no such points.
     """
-    steps = WIDE * np.eye(len(found.x))
-    ahead, behind = (np.array([residuals(found.x + sign * step) for step in steps]) for sign in (1.0, -1.0))
+    steps = WIDE * np.eye(len(at))
+    ahead, behind = (np.array([residuals(at + sign * step) for step in steps]) for sign in (1.0, -1.0))
     met = (ahead != 0.0).all(axis=0) & (behind != 0.0).all(axis=0)
     met[:n_known] = True
     return np.asarray(np.where(met, (ahead - behind) / (2.0 * WIDE), 0.0).T)

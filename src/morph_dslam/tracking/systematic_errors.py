@@ -377,22 +377,32 @@ class SystematicErrors:
         found[:, measured] = self._by_known[:, measured]
         return found
 
-    def deformation_errors(self, state: State, changes: Array, left: float) -> Callable[[], Array]:
+    def deformation_errors(
+        self, state: State, of_model: Callable[[Array], tuple[Array, float]] | None
+    ) -> Callable[[], Array]:
         """By how much what the deformation moves the pixels by (p, 2, c) may be off in the last frame that was kept.
 
-        The columns are the error factors of the reference, in their deviations, the ``changes`` and the displacement's
-        modes. Where nothing but the images tells of the parameters, these make the changes good.
+        The columns are the error factors of the reference, in their deviations, those of the model and the
+        displacement's modes. Where nothing but the images tells of the parameters, these make the model's good. Few
+        frames are asked: all is computed when one is.
 
         Parameters
         ----------
         state : of the frame.
-        changes : (d, k) of the parameters which move the surface as errors of the model do, SI.
-        left : of the displacement, by what no parameters make good, root mean square length, metres.
+        of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
+            what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        not_made_good = self._by_known[:, : len(changes)] @ changes
-        return partial(self._of_deformation, state, self.reference_factor * self._by_reference, not_made_good, left)
+        by_reference, by_known = self.reference_factor * self._by_reference, self._by_known
+        return partial(self._of_deformation, state, by_reference, by_known, of_model)
 
-    def _of_deformation(self, state: State, by_reference: Array, not_made_good: Array, left: float) -> Array:
+    def _of_deformation(
+        self,
+        state: State,
+        by_reference: Array,
+        by_known: Array,
+        of_model: Callable[[Array], tuple[Array, float]] | None,
+    ) -> Array:
+        changes, left = (np.zeros((0, 0)), 0.0) if of_model is None else of_model(state.parameters)
         modes, rows = self._points.field.modes, self._points.field.functions.rows(state.parameters)
         d, m = len(rows) - 1, len(modes)
         # Errors of any smooth shape, as likely one as the other: the modes are the shapes that the object takes.
@@ -407,7 +417,8 @@ class SystematicErrors:
             pixels = self._estimator.camera.project(state.camera_from_object.apply(self._corners.rest))
             at_rest = _warped_motions(pixels, self._inverse_edges, self._moved)
             of_reference += np.sqrt(self._misfit.factor) * (at_rest - self._warped(state, self._moved))
-        return np.concatenate([of_reference, by_state @ not_made_good, all_columns[:, :, d : d + m]], axis=2)
+        not_made_good = by_state @ by_known[:, : len(changes)] @ changes
+        return np.concatenate([of_reference, not_made_good, all_columns[:, :, d : d + m]], axis=2)
 
     def linearized(self, estimate: Estimate, weights: Array) -> Linearization:
         """The frame of an estimate whose points had these ``weights`` (p,)."""

@@ -461,7 +461,7 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
         state, covariance = refine_reference(tracker.estimator, known_state(part), pixels, registration.state, chosen)
         refined = replace(registration, state=state, covariance=covariance)
     else:
-        # What the state is wrong by counts with the discrepancy: both at once would be the same twice.
+        # What the state is wrong by counts with the discrepancy: to refine both would be the same twice.
         bound, seen = bind_landmarks(part.model, landmarks.points), part.camera.undistort_pixels(landmarks.pixels)
         known = Reference(registration.state, pixels, bound, seen, landmark_deviation(registration.facts["sigma_px"]))
         fit = DiscrepancyFit(part.model, part.camera, part.options.discrepancy)

@@ -445,11 +445,10 @@ class Tracker:
 
     def deformation_errors(self) -> OffByFactors | None:
         """By how much what the deformation moves points by may be off in the last frame; None where that is unknown."""
-        systematic, errors, mu = self._view.systematic, self._model_errors, self._last.parameters
+        systematic, errors = self._view.systematic, self._model_errors
         if systematic is None:
             return None
-        changes, left = (np.zeros((len(mu), 0)), 0.0) if errors is None else errors.in_common(mu)
-        return systematic.deformation_errors(self._last, changes, left)
+        return systematic.deformation_errors(self._last, None if errors is None else errors.in_common)
 
     @property
     def jumps(self) -> tuple[DisplacementJump, ...]:
