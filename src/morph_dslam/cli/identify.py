@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from morph_dslam.cli.arguments import add_file, add_flag, add_output, add_repeated, file_and_column
 from morph_dslam.errors import IdentificationError
-from morph_dslam.io.folders import check_free
 
 if TYPE_CHECKING:
     from morph_dslam import ReducedModel, Run
@@ -52,6 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import load_model, load_run
     from morph_dslam.extend.identification import (
         KnownValues,
+        check_no_identification,
         identification_lines,
         identify,
         last_line,
@@ -62,8 +62,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     if len(arguments.reaction) != len(arguments.force):
         raise IdentificationError("give one --reaction SET:AXIS for each --force, in the same order")
-    sign = arguments.output / "identification.json"
-    check_free(sign, "an identification", arguments.overwrite, IdentificationError)
+    check_no_identification(arguments.output, arguments.overwrite)
     model = load_model(arguments.model)
     folder: Path | None = arguments.run_folder
     tracked = None if folder is None else load_run(folder)

@@ -15,6 +15,7 @@ from morph_dslam.identification.measurements import (
 )
 from morph_dslam.identification.prior import KnownValues as KnownValues
 from morph_dslam.identification.report import (
+    check_no_identification as check_no_identification,
     identification_lines as identification_lines,
     last_line as last_line,
     write_identification as write_identification,

@@ -18,6 +18,7 @@ from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.doubts import notices
 from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
+from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter
 from morph_dslam.units import FACTORS
@@ -258,12 +259,21 @@ def last_line(figures: Mapping[str, Any]) -> str:
     return " ".join(parts)
 
 
+#: The file by which an identification is known.
+RESULT = "identification.json"
+
+
+def check_no_identification(folder: Path, overwrite: bool) -> None:
+    """Raise IdentificationError if a folder holds an identification that is not to be overwritten."""
+    check_free(folder / RESULT, "an identification", overwrite, IdentificationError)
+
+
 def write_identification(folder: Path, found: Identification) -> dict[str, Any]:
     """Write ``identification.json`` and ``identification.png``; returns the figures."""
     figures = summarise(found)
     with writing(IdentificationError, folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "identification.json").write_text(json.dumps(figures, indent=2) + "\n")
+        (folder / RESULT).write_text(json.dumps(figures, indent=2) + "\n")
         plot(folder / "identification.png", found.misfits)
     return figures
 
