@@ -21,11 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import matplotlib
 import numpy as np
-from tension_fit import Fit, TensionTest, evaluate_tests, fit_law, relative_error
 
 import morph_dslam as md
 from morph_dslam.extend import run_and_report_errors
-from morph_dslam.extend.mechanics import Ogden
+from morph_dslam.extend.material_tests import Fit, MaterialTest, NominalStress, fit_law, relative_error
+from morph_dslam.extend.mechanics import Material, Ogden
 from support import data_folder
 
 matplotlib.use("Agg")
@@ -52,7 +52,7 @@ def read_sheet(path: Path) -> np.ndarray:
         raise md.MorphError(f"{path} is no sheet of time, stretch and stress: {error}") from error
 
 
-def read_test(path: Path, kind: str) -> TensionTest:
+def read_test(path: Path, kind: str) -> MaterialTest:
     """One measurement, thinned, in SI; it begins at rest and undeformed."""
     time, stretch, stress = read_sheet(path).T
     last = len(time) - 1
@@ -66,12 +66,12 @@ def read_test(path: Path, kind: str) -> TensionTest:
     name = f"{'relaxation' if kind == RELAXATION else 'loop'} {label}"
     # The first reading of a loop is taken at a small stretch already.
     start = time[0] - 1e-3
-    return TensionTest(
+    return MaterialTest(
         name, np.r_[1.0, stretch[chosen]], np.r_[0.0, stress[chosen] * KILOPASCAL], np.r_[start, time[chosen]]
     )
 
 
-def read_tests(folder: Path) -> tuple[list[TensionTest], list[TensionTest]]:
+def read_tests(folder: Path) -> tuple[list[MaterialTest], list[MaterialTest]]:
     """The tests to fit, and those to predict."""
     fitted, predicted = [], []
     for kind, stretches in FITTED.items():
@@ -91,18 +91,23 @@ def two_term_ogden(modulus_1: float, exponent_1: float, modulus_2: float, expone
     return Ogden(moduli=(modulus_1, modulus_2), exponents=(exponent_1, exponent_2), bulk=1e8)
 
 
-def fit(tests: list[TensionTest]) -> Fit:
+def fit(tests: list[MaterialTest]) -> Fit:
     bounds = {"modulus_1": (1e3, 1e6), "exponent_1": (0.2, 2.0), "modulus_2": (1e2, 1e5), "exponent_2": (2.0, 6.0)}
     shares, times = [(0.01, 0.99)] * 3, [(0.1, 5.0), (5.0, 50.0), (50.0, 1000.0)]
     return fit_law(two_term_ogden, bounds, tests, (shares, times), starts=2)
 
 
-def overall_error(tests: list[TensionTest], computed: list[np.ndarray]) -> float:
+def evaluate_tests(material: Material, tests: list[MaterialTest]) -> list[np.ndarray]:
+    """Nominal stress (n,), Pa, of a material in each test."""
+    return [NominalStress(material, test)() for test in tests]
+
+
+def overall_error(tests: list[MaterialTest], computed: list[np.ndarray]) -> float:
     """Root mean square difference of all tests over their root mean square stress, percent."""
     return 100.0 * relative_error(np.concatenate([t.stress for t in tests]), np.concatenate(computed))
 
 
-def draw(parts: dict[str, tuple[list[TensionTest], list[np.ndarray]]], path: Path) -> None:
+def draw(parts: dict[str, tuple[list[MaterialTest], list[np.ndarray]]], path: Path) -> None:
     """Measured points and computed lines: relaxation over time, loops over stretch for each rate."""
     figure, axes = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
     rates = ["0.01/s", "0.03/s", "0.05/s"]

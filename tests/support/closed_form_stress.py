@@ -63,6 +63,13 @@ def gent(F, shear, limit, bulk):
     return from_invariants(F, 0.5 * shear * limit / (limit - x), 0.0) + volumetric(F, bulk)
 
 
+def arruda_boyce(F, shear, limit, bulk):
+    _, i1, _, J = invariants(F)
+    x = J ** (-2 / 3) * i1 / limit**2
+    series = 1 / 2 + x / 10 + 11 * x**2 / 350 + 19 * x**3 / 1750 + 519 * x**4 / 134750
+    return from_invariants(F, shear * series, 0.0) + volumetric(F, bulk)
+
+
 def ogden(F, moduli, exponents, bulk):
     """By principal stretches; an orthonormal basis exists where they are equal too."""
     squares, axes = np.linalg.eigh(F.T @ F)

@@ -10,6 +10,7 @@ import numpy as np
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, Orthotropic, TransverselyIsotropic
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.materials.isotropic import (
+    ArrudaBoyce,
     Gent,
     Hyperfoam,
     LinearElastic,
@@ -70,6 +71,7 @@ _HOOKE = {"young": 3.0, "poisson": 0.3}
 _MOONEY = {"c10": 0.3, "c01": 0.12, "bulk": 7.0}
 _YEOH = {"c10": 0.4, "c20": -0.02, "c30": 0.004, "bulk": 7.0}
 _GENT = {"shear": 0.8, "limit": 12.0, "bulk": 7.0}
+_CHAINS = {"shear": 0.8, "limit": 2.5, "bulk": 7.0}
 _HGO = {"shear": 0.5, "k1": 1.3, "k2": 0.7, "dispersion": 0.1, "bulk": 7.0}
 #: name -> (material, closed form P(F)).
 LAWS = {
@@ -79,6 +81,7 @@ LAWS = {
     "mooney_rivlin": (MooneyRivlin(**_MOONEY), partial(exact.mooney_rivlin, **_MOONEY)),
     "yeoh": (Yeoh(**_YEOH), partial(exact.yeoh, **_YEOH)),
     "gent": (Gent(**_GENT), partial(exact.gent, **_GENT)),
+    "arruda_boyce": (ArrudaBoyce(**_CHAINS), partial(exact.arruda_boyce, **_CHAINS)),
     "ogden": (
         Ogden(moduli=MODULI, exponents=EXPONENTS, bulk=7.0),
         partial(exact.ogden, moduli=MODULI, exponents=EXPONENTS, bulk=7.0),

@@ -366,6 +366,7 @@ def test_every_program_is_run_by_a_test():
     assert {page: count for page, count in counts.items() if count} == {
         "certificate": 1,
         "export": 1,
+        "material-tests": 1,
         "materials": 1,
         "meshes": 1,
         "model-file": 2,
@@ -408,6 +409,13 @@ def test_law_of_ones_own():
     np.testing.assert_allclose(stiffness[3, 3], 2.5e5, rtol=1e-10)
     np.testing.assert_allclose(stiffness[0, 0], 5e6 + 4.0 / 3.0 * 2.5e5, rtol=1e-10)
     assert law.function(ngs.Id(3), 2.0).dim == 1
+
+
+def test_a_law_of_ones_own_is_fitted(capsys):
+    names = run_sample("material-tests")
+    # The sample's stress is neo-Hookean, which Gent's law is if its chains are endless.
+    assert names["fit"].constants["shear"] == pytest.approx(0.4e6, rel=2e-3)
+    assert "shear" in capsys.readouterr().out
 
 
 def test_report_from_the_model_alone(tmp_path, monkeypatch):

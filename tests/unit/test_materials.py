@@ -5,11 +5,13 @@ from dataclasses import replace
 import ngsolve as ngs
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.materials.anisotropic import HolzapfelGasserOgden, TransverselyIsotropic, turned_direction
 from morph_dslam.mechanics.materials.base import evaluate, isotropic_average
 from morph_dslam.mechanics.materials.isotropic import (
+    ArrudaBoyce,
     Gent,
     Hyperfoam,
     LinearElastic,
@@ -101,11 +103,15 @@ def test_the_energy_is_its_remainder_and_the_volumetric_part(name):
         ("mooney_rivlin", 7.0, 0.84),
         ("yeoh", 7.0, 0.8),
         ("gent", 7.0, 0.8),
+        (
+            "arruda_boyce", 7.0,
+            0.8 * (1 + 3 / 5 / 2.5**2 + 99 / 175 / 2.5**4 + 513 / 875 / 2.5**6 + 42039 / 67375 / 2.5**8),
+        ),
         ("ogden", 7.0, 0.35),
         ("hyperfoam", 2.0 * (0.4 * (1.0 / 3.0 + 0.5) + 0.1 / 3.0), 0.5),
         ("user_material", 7.0, 0.84),
     ],
-)
+)  # fmt: skip
 def test_isotropic_laws_become_hookes_law_at_small_strain(name, bulk, shear):
     expected = np.diag([2.0 * shear] * 3 + [shear] * 3)
     expected[:3, :3] += bulk - 2.0 / 3.0 * shear
@@ -113,6 +119,17 @@ def test_isotropic_laws_become_hookes_law_at_small_strain(name, bulk, shear):
     poisson = (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear)
     assert ELASTIC[name].equivalent_poisson == pytest.approx(poisson, abs=1e-13)
     ELASTIC[name].check()
+
+
+def test_five_terms_of_arruda_and_boyce_leave_the_sixth_of_the_inverse_langevin_function():
+    def departure(limit):
+        chain = np.sqrt(np.trace(F @ F) / 3.0)
+        force = brentq(lambda beta: 1.0 / np.tanh(beta) - 1.0 / beta - chain / limit, 1e-3, 100.0, xtol=1e-15)
+        law = ArrudaBoyce(shear=1.0, limit=limit, bulk=7.0)
+        return abs(from_invariants(F, limit * force / (6.0 * chain), 0.0) - stress(law, F)).max()
+
+    F = np.diag([2.0, 2.0**-0.5, 2.0**-0.5])
+    assert np.log2(departure(6.0) / departure(12.0)) == pytest.approx(10.0, abs=0.2)
 
 
 def test_orthotropy_in_the_axes_of_space_has_the_inverse_of_its_compliance():

@@ -20,7 +20,7 @@ from morph_dslam.errors import MorphError, refusal
 
 #: Commands in the order in which `morph --help` lists them.
 COMMANDS = (
-    "build", "info", "simulate", "export", "explore", "track", "live", "evaluate", "slam", "calibrate", "inner",
+    "fit", "build", "info", "simulate", "export", "explore", "track", "live", "evaluate", "slam", "calibrate", "inner",
     "register", "board", "identify", "studio", "doctor",
 )  # fmt: skip
 USER_ERROR = 2

@@ -7,6 +7,7 @@ file that registers it. Building blocks stand in a module for each subject:
 `extend.calibration`   cameras that are fixed to each other
 `extend.geometry`      rigid and similarity transforms, rotations
 `extend.identification` constant parameters from measured points and forces
+`extend.material_tests` laws fitted to stress-strain tables of tests
 `extend.mechanics`     meshes, hyperelastic laws, supports, loads, and what solves a `SolidProblem`
 `extend.models`        separated fields, functions of the parameters, points that a model carries
 `extend.reduction`     methods that reduce solutions, and their certificate

@@ -32,6 +32,7 @@ from morph_dslam.mechanics.materials.catalogue import (
     material_catalogue as material_catalogue,
 )
 from morph_dslam.mechanics.materials.isotropic import (
+    ArrudaBoyce as ArrudaBoyce,
     Gent as Gent,
     Hyperfoam as Hyperfoam,
     LinearElastic as LinearElastic,

@@ -221,6 +221,43 @@ class Gent(Rubber):
         self.require_positive("shear", "limit", "bulk")
 
 
+#: Coefficients of the inverse Langevin function's series, as Abaqus has them.
+_CHAIN_SERIES = (1.0 / 2.0, 1.0 / 20.0, 11.0 / 1050.0, 19.0 / 7000.0, 519.0 / 673750.0)
+
+
+@register_law("arruda_boyce")
+class ArrudaBoyce(Rubber):
+    """Arruda-Boyce rubber: eight chains of finite length, by five terms of their series.
+
+    Energy  W = mu sum_i Ci / m^(2i - 2) (I1~^i - 3^i) + kappa/2 (J - 1)^2,  m = limit,
+            C = 1/2, 1/20, 11/1050, 19/7000, 519/673750
+    Stress  incompressible uniaxial: P = 2 mu (l - l^-2) sum_i i Ci / m^(2i - 2) I1^(i - 1)
+    Shear modulus mu (1 + 3/5 m^-2 + 99/175 m^-4 + 513/875 m^-6 + 42039/67375 m^-8).
+
+    Arruda and Boyce, J. Mech. Phys. Solids 41, 1993. The series is finite everywhere; it locks less sharply than the
+    chains near the limit.
+
+    Attributes
+    ----------
+    shear : mu, Pa; the shear modulus at small strain is a little larger.
+    limit : m, the stretch at which the chains are fully extended, such as 7 for a soft rubber.
+    """
+
+    shear: Constant
+    limit: Constant
+    quantities: ClassVar = {"limit": "ratio"}
+
+    def distortional(self, F: Any, J: Any) -> Any:
+        x = first_invariant(F, J)
+        energy: Any = 0.0
+        for i, factor in enumerate(_CHAIN_SERIES, start=1):
+            energy = energy + factor / self.limit ** (2 * i - 2) * (x**i - 3.0**i)
+        return self.shear * energy
+
+    def check_constants(self) -> None:
+        self.require_positive("shear", "limit", "bulk")
+
+
 #: Where the series take over: relative size of the deviator, and (q / mean of the pair)^2.
 _NEARLY_SPHERICAL = 0.03
 _NEARLY_PAIRED = 1e-3

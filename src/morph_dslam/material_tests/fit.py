@@ -1,0 +1,213 @@
+"""Constants of a law that come closest to material tests, with their standard deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import ngsolve as ngs
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, least_squares
+
+from morph_dslam.errors import IdentificationError
+from morph_dslam.material_tests.nominal_stress import MaterialTest, NominalStress, relative_error
+from morph_dslam.mechanics.materials.base import Material
+from morph_dslam.mechanics.materials.viscoelastic import Prony
+
+Array = NDArray[np.float64]
+#: Lowest and highest value of a constant; positive bounds far apart are searched by orders of magnitude.
+Bounds = tuple[float, float]
+#: A difference, over the test's root mean square stress, that stands for a law beyond its limit.
+_FAR = 1e3
+#: A constant this close to an end of its bounds, over their distance, is at the end.
+_AT_END = 1e-7
+#: Neighbouring differences are taken as correlated by no more than this.
+_MOST_CORRELATED = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Result of a fit.
+
+    Attributes
+    ----------
+    material : the law with the constants found.
+    constants : these by name, those of the Prony series included.
+    deviations : standard deviations of the constants; infinite where the tests do not determine one, not a number where
+        one is at an end of its bounds.
+    errors : root mean square difference over root mean square stress of each test.
+    error : the root mean square of `errors`: each test counts alike.
+    computed : the nominal stress (n,) of each test, Pa.
+    """
+
+    material: Material
+    constants: dict[str, float]
+    deviations: dict[str, float]
+    errors: tuple[float, ...]
+    error: float
+    computed: tuple[Array, ...]
+
+
+class _Unknowns:
+    """Constants to be found as NGSolve parameters, seen as a vector in [0, 1]^k."""
+
+    def __init__(self, bounds: Mapping[str, Bounds]) -> None:
+        for name, (low, high) in bounds.items():
+            if not low < high:
+                raise IdentificationError(f"the bounds of {name} must be increasing, not {low:g}, {high:g}")
+        self.low, self.high = np.array(list(bounds.values()), dtype=float).T
+        # Moduli and times span decades: equal steps of their logarithms.
+        self.logarithmic = (self.low > 0.0) & (self.high >= 100.0 * self.low)
+        self.symbols = {name: ngs.Parameter(0.0) for name in bounds}
+
+    def values(self, unit: Array) -> Array:
+        linear = self.low + unit * (self.high - self.low)
+        safe = np.where(self.logarithmic, self.low, 1.0), np.where(self.logarithmic, self.high, 1.0)
+        return np.where(self.logarithmic, safe[0] * (safe[1] / safe[0]) ** unit, linear)
+
+    def slopes(self, unit: Array) -> Array:
+        """(k,) derivatives of the values by the vector."""
+        ratio = np.where(self.logarithmic, self.high, 2.0) / np.where(self.logarithmic, self.low, 1.0)
+        return np.where(self.logarithmic, self.values(unit) * np.log(ratio), self.high - self.low)
+
+    def set(self, unit: Array) -> None:
+        for symbol, value in zip(self.symbols.values(), self.values(unit), strict=True):
+            symbol.Set(float(value))
+
+
+def fit_law(
+    law: Callable[..., Material],
+    bounds: Mapping[str, Bounds],
+    tests: Sequence[MaterialTest],
+    prony_bounds: tuple[Sequence[Bounds], Sequence[Bounds]] | None = None,
+    starts: int = 8,
+    seed: int = 0,
+) -> Fit:
+    """Constants of an incompressible law that come closest to the measured stresses.
+
+    Every test counts alike: its differences are divided by its root mean square stress and by the root of its
+    number of points. Standard deviations take the scatter from the differences that are left, and count points whose
+    differences have one sign for longer as fewer (`_effective_share`).
+
+    Parameters
+    ----------
+    law : makes the material from its constants by keyword, `functools.partial(Gent, bulk=...)` say.
+    bounds : constant -> lowest and highest value.
+    tests : what was measured.
+    prony_bounds : bounds of the shares of the relaxing stress and of the times (s) of a Prony series of
+        relative moduli; share i is what term i takes of the stiffness that terms before it have left, so
+        that any shares in [0, 1) make a stable series. None: an elastic law.
+    starts : local searches from points spread over the bounds; the best is kept.
+    seed : of the starts.
+
+    Raises
+    ------
+    IdentificationError
+        If the bounds do not increase, there are fewer stresses than constants, or no search found constants with finite
+        stresses.
+    """
+    all_bounds, n_terms = dict(bounds), 0
+    if prony_bounds is not None:
+        n_terms = len(prony_bounds[0])
+        for kind, entries in zip(("share", "time"), prony_bounds, strict=True):
+            all_bounds |= {f"{kind}_{i + 1}": entry for i, entry in enumerate(entries)}
+    unknowns = _Unknowns(all_bounds)
+    if (n_stressed := sum(int(np.count_nonzero(test.stress)) for test in tests)) < len(all_bounds):
+        raise IdentificationError(f"{n_stressed} stresses do not determine {len(all_bounds)} constants; measure more")
+    curves = [NominalStress(assembled(law, unknowns.symbols, n_terms), test) for test in tests]
+    weights = [1.0 / np.linalg.norm(test.stress) for test in tests]
+
+    def differences(unit: Array) -> Array:
+        unknowns.set(unit)
+        parts = [w * (c() - t.stress) for w, c, t in zip(weights, curves, tests, strict=True)]
+        # A law beyond its limit (Gent's) is not a number; a large finite difference sends the search back.
+        return np.nan_to_num(np.concatenate(parts), nan=_FAR, posinf=_FAR, neginf=-_FAR)
+
+    best = _best_of(differences, len(all_bounds), starts, seed)
+    unknowns.set(best.x)
+    computed = tuple(curve() for curve in curves)
+    errors = tuple(relative_error(t.stress, c) for t, c in zip(tests, computed, strict=True))
+    values = dict(zip(all_bounds, unknowns.values(best.x).tolist(), strict=True))
+    inside = (best.x > _AT_END) & (best.x < 1.0 - _AT_END)
+    deviations = np.full(len(best.x), np.nan)
+    slopes = best.jac[:, inside] / unknowns.slopes(best.x)[inside]
+    deviations[inside] = _deviations(slopes, best.fun, [len(t.stress) for t in tests])
+    return Fit(
+        material=assembled(law, values, n_terms),
+        constants=values,
+        deviations=dict(zip(all_bounds, deviations.tolist(), strict=True)),
+        errors=errors,
+        error=float(np.sqrt(np.mean(np.square(errors)))),
+        computed=computed,
+    )
+
+
+def _best_of(differences: Callable[[Array], Array], size: int, starts: int, seed: int) -> OptimizeResult:
+    points = np.random.default_rng(seed).random((starts, size))
+    points[0] = 0.5
+    results = [
+        least_squares(differences, point, bounds=(0.0, 1.0), x_scale="jac", max_nfev=200, xtol=1e-10)
+        for point in points
+    ]
+    best = min(results, key=lambda result: result.cost)
+    if not best.cost < _FAR:
+        raise IdentificationError("no constants within the bounds give finite stresses; widen the bounds of the fit")
+    return best
+
+
+def _deviations(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Array:
+    """(k,) standard deviations of constants from what a fit left.
+
+    Each test has its own scatter, so the covariance is the sandwich of White (Econometrica 48, 1980) by tests.
+
+    Parameters
+    ----------
+    jacobian : (n, k) slopes of the differences of all tests.
+    differences : (n,) what is left.
+    sizes : points of each test.
+    """
+    n, k = jacobian.shape
+    if k == 0:
+        return np.zeros(0)
+    scale = np.linalg.norm(jacobian, axis=0)
+    if not np.all(scale > 0.0) or np.linalg.matrix_rank(jacobian / scale) < k:
+        return np.full(k, np.inf)
+    scaled = jacobian / scale
+    inverse = np.linalg.inv(scaled.T @ scaled)
+    meat = np.zeros((k, k))
+    ends = np.cumsum(sizes)
+    for start, end in zip(ends - sizes, ends, strict=True):
+        part, left = scaled[start:end], differences[start:end]
+        # Constants take degrees of freedom from all tests in proportion to their points.
+        variance = left @ left / max((end - start) * (1.0 - k / n), 1.0)
+        meat += variance / _effective_share(left) * part.T @ part
+    return np.sqrt(np.diag(inverse @ meat @ inverse)) / scale
+
+
+def _effective_share(left: Array) -> float:
+    """The share of points that count as independent, from the correlation r of neighbours: (1 - r) / (1 + r).
+
+    A law that does not fit leaves a smooth curve, whose points are no independent draws (Bayley and Hammersley,
+    Supplement to the J. R. Stat. Soc. 8, 1946).
+    """
+    energy = float(left @ left)
+    if energy == 0.0 or len(left) < 3:
+        return 1.0
+    correlation = min(max(float(left[1:] @ left[:-1]) / energy, 0.0), _MOST_CORRELATED)
+    return (1.0 - correlation) / (1.0 + correlation)
+
+
+def assembled(law: Callable[..., Material], values: Mapping[str, Any], n_terms: int) -> Material:
+    """The material of named constants, the ``n_terms`` of the Prony series among them."""
+    own = {k: v for k, v in values.items() if not k.startswith(("share_", "time_"))}
+    material = law(**own)
+    if n_terms == 0:
+        return material
+    moduli, left = [], 1.0
+    for i in range(n_terms):
+        moduli.append(left * values[f"share_{i + 1}"])
+        left = left * (1.0 - values[f"share_{i + 1}"])
+    times = tuple(values[f"time_{i + 1}"] for i in range(n_terms))
+    return replace(material, prony=Prony(tuple(moduli), times, (0.0,) * n_terms))

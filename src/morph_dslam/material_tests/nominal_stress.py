@@ -1,0 +1,152 @@
+"""Nominal stress of a law in the tests whose strain is uniform.
+
+The solid is taken as incompressible, as rubber, silicone and gels nearly are. At stretch l its principal stretches are
+powers of l whatever the law, and the pressure is eliminated by the direction that is free of stress: with S1 and S3 the
+second Piola-Kirchhoff stress of the law's remainder along the pull and along the free direction, the nominal stress
+is P = l S1 - S3 l3^2 / l (Holzapfel, Nonlinear Solid Mechanics, 2000, section 6.5). With a Prony series S1 and S3
+advance in time by the recurrence of `viscous_history`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import ngsolve as ngs
+import numpy as np
+from ngsolve.meshes import Make1DMesh
+from numba import njit
+from numpy.typing import NDArray
+
+from morph_dslam.errors import IdentificationError
+from morph_dslam.mechanics.materials.base import Material
+
+Array = NDArray[np.float64]
+#: The principal stretches of each kind of test as powers of the measured one; the third direction is free of stress.
+KINDS = {"uniaxial": (1.0, -0.5, -0.5), "biaxial": (1.0, 1.0, -2.0), "planar": (1.0, 0.0, -1.0)}
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTest:
+    """One test on one specimen.
+
+    Attributes
+    ----------
+    name : for reports.
+    stretch : (n,) deformed over undeformed length.
+    stress : (n,) nominal stress, force over undeformed section, Pa.
+    time : (n,) s, increasing; the specimen has rested before the first. None: so slow that time is no matter.
+    kind : "uniaxial" (tension or compression of a bar), "biaxial" (equal in two directions), or "planar" (tension of
+        a wide strip that keeps its width, also called pure shear).
+
+    Raises
+    ------
+    IdentificationError
+        If the arrays do not match, a value is not finite, a stretch is not above zero, the time does not increase,
+        nothing is stressed, or there is no such kind.
+    """
+
+    name: str
+    stretch: Array
+    stress: Array
+    time: Array | None = None
+    kind: str = "uniaxial"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise IdentificationError(f"{self.name}: '{self.kind}' is no kind of test; give {', '.join(KINDS)}")
+        columns = [self.stretch, self.stress] + ([] if self.time is None else [self.time])
+        if len({np.shape(column) for column in columns}) > 1 or np.ndim(self.stretch) != 1:
+            raise IdentificationError(f"{self.name}: give as many stresses and times as stretches")
+        if not all(np.isfinite(column).all() for column in columns):
+            raise IdentificationError(f"{self.name}: a value is not a finite number")
+        if not np.all(np.asarray(self.stretch) > 0.0):
+            raise IdentificationError(
+                f"{self.name}: a stretch of {np.min(self.stretch):g} is not above zero; it is deformed over undeformed "
+                "length, 1 at rest (a strain is 0 there)"
+            )
+        if self.time is not None and not np.all(np.diff(self.time) > 0.0):
+            raise IdentificationError(f"{self.name}: the time must increase from line to line")
+        if not np.any(self.stress):
+            raise IdentificationError(f"{self.name}: no stress is other than zero")
+
+    @property
+    def principal_stretches(self) -> Array:
+        """(n, 3) stretches along the pull, across it, and in the direction that is free."""
+        return np.asarray(self.stretch)[:, None] ** np.array(KINDS[self.kind])
+
+    @property
+    def first_invariant(self) -> Array:
+        """(n,) I1, the sum of the squared principal stretches."""
+        return np.square(self.principal_stretches).sum(axis=1)
+
+
+class NominalStress:
+    """Nominal stress of a law in a test; the law's parameters may change between calls.
+
+    Parameters
+    ----------
+    material : a law whose remainder is its distortional energy, as the rubber laws are.
+    test : its kind, stretches and times; not its stress.
+    """
+
+    def __init__(self, material: Material, test: MaterialTest) -> None:
+        self.material = material
+        self.stretch = np.asarray(test.stretch, dtype=float)
+        self._time = None if test.time is None else np.asarray(test.time, dtype=float)
+        self._free = test.principal_stretches[:, 2]
+        n = len(self.stretch)
+        mesh = Make1DMesh(n)
+        # One cell for each stretch: fields constant in cells carry them all through one evaluation.
+        stretches = []
+        for values in test.principal_stretches.T:
+            field = ngs.GridFunction(ngs.L2(mesh, order=0))
+            field.vec.FV().NumPy()[:] = values
+            stretches.append(field)
+        first, second, third = stretches
+        F = ngs.CF((first, 0, 0, 0, second, 0, 0, 0, third), dims=(3, 3)).MakeVariable()
+        stress = ngs.Inv(F) * material.parts(F)[0].Diff(F)
+        self._components = ngs.CF((stress[0, 0], stress[2, 2])).Compile()
+        self._points = mesh((np.arange(n) + 0.5) / n)
+
+    def __call__(self) -> Array:
+        """(n,) nominal stress, Pa."""
+        stress = np.asarray(self._components(self._points))
+        prony = self.material.prony
+        if prony is not None and self._time is not None:
+            moduli, times = (
+                np.array([ngs.CF(value)(self._points)[0, 0] for value in values])
+                for values in (prony.relative_moduli, prony.times)
+            )
+            stress = relaxed_stress(stress, self._time, moduli, times)
+        return self.stretch * stress[:, 0] - stress[:, 1] * self._free**2 / self.stretch
+
+
+@njit(cache=True, nogil=True)
+def relaxed_stress(instantaneous: Array, time: Array, moduli: Array, times: Array) -> Array:
+    """Stress (n, k) with a Prony series, from the instantaneous one (n, k) at ``time`` (n,).
+
+    The exponential midpoint rule of `viscous_history`; the state before the first time is free of stress, and the first
+    step is instantaneous.
+    """
+    n, k = instantaneous.shape
+    overstress = np.outer(moduli, instantaneous[0])
+    equilibrium = 1.0 - moduli.sum()
+    stress = np.empty((n, k))
+    stress[0] = instantaneous[0]
+    for j in range(1, n):
+        step = time[j] - time[j - 1]
+        for c in range(k):
+            change = instantaneous[j, c] - instantaneous[j - 1, c]
+            total = equilibrium * instantaneous[j, c]
+            for i in range(len(moduli)):
+                decay = np.exp(-0.5 * step / times[i])
+                overstress[i, c] = decay * (decay * overstress[i, c] + moduli[i] * change)
+                total += overstress[i, c]
+            stress[j, c] = total
+    return stress
+
+
+def relative_error(measured: Array, computed: Array) -> float:
+    """Root mean square difference over the root mean square of what was measured."""
+    difference = np.asarray(computed) - np.asarray(measured)
+    return float(np.linalg.norm(difference) / np.linalg.norm(measured))
