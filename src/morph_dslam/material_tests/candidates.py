@@ -20,13 +20,22 @@ from morph_dslam.mechanics.materials.isotropic import ArrudaBoyce, Gent, MooneyR
 Array = NDArray[np.float64]
 #: A law with fewer constants is taken if its error is at most this many times the smallest, or smaller than `_SMALL`,
 #: which no test of rubber repeats.
-ALIKE, _SMALL = 1.1, 0.01
+_ALIKE, _SMALL = 1.1, 0.01
+#: Where bars in tension are all that was tested, laws of the first invariant alone are taken up to this many times the
+#: smallest error: what tension of a bar tells of the second one rules all else and is mostly error.
+_ALIKE_BY_FIRST = 1.5
+#: Laws up to this many times the smallest error say how much is open where nothing was measured.
+_COMPARED = 2.0
+#: Laws of the first invariant alone.
+_BY_FIRST = ("neo_hookean", "yeoh", "gent", "arruda_boyce")
 #: Moduli are sought within this factor of the shear modulus that a neo-Hookean solid has in the tests.
 _FACTOR = 50.0
 #: Ogden's exponents are in one of these ranges.
 _POSITIVE, _NEGATIVE = (0.2, 15.0), (-6.0, -0.2)
 #: Tests with stretches below this say something of compression.
 _COMPRESSED = 0.95
+#: By this factor the range of a relaxation time reaches into its neighbours'.
+_OVERLAP = 5.0
 #: The bulk modulus over the shear modulus of what is written: such tests do not measure it.
 BULK_OVER_SHEAR = 1000.0
 
@@ -232,33 +241,39 @@ def neo_hookean_shape(test: MaterialTest) -> Array:
 
 
 def _series_bounds(tests: Sequence[MaterialTest], n_terms: int) -> tuple[list[Bounds], list[Bounds]]:
-    """Bounds of shares and times of a Prony series: one range of times beside the other, as long as tests tell."""
+    """Bounds of shares and times of a Prony series: a range of times for each term, as far as tests tell."""
     timed = [test.time for test in tests if test.time is not None]
     if not timed:
         raise IdentificationError("a Prony series needs tests with times; give a column such as time_s")
-    shortest = min(float(np.diff(time).min()) for time in timed)
+    # A process faster than most intervals of the quickest test does not show.
+    shortest = min(float(np.median(np.diff(time))) for time in timed)
     longest = max(float(time[-1] - time[0]) for time in timed)
     edges = np.geomspace(shortest, 2.0 * longest, n_terms + 1)
-    return [(0.0, 0.99)] * n_terms, list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    # Ranges overlap, for processes do not keep to a grid.
+    low, high = np.maximum(edges[:-1] / _OVERLAP, shortest), np.minimum(edges[1:] * _OVERLAP, 2.0 * longest)
+    return [(0.0, 0.99)] * n_terms, list(zip(low.tolist(), high.tolist(), strict=True))
 
 
-def recommended(fitted: Sequence[FittedLaw]) -> FittedLaw:
-    """The law with the fewest constants of those that `as_good` gives."""
-    alike = as_good(fitted)
+def recommended(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> FittedLaw:
+    """The law with the fewest constants of those that fit nearly as well as the best.
+
+    Where bars in tension are all that was tested, laws of the first invariant alone come first.
+    """
+    alike = _alike(fitted, _ALIKE)
+    if Span.of(tests).tension_alone:
+        alike = [each for each in _alike(fitted, _ALIKE_BY_FIRST) if each.name in _BY_FIRST] or alike
     return min(alike, key=lambda each: (len(each.fit.constants), each.fit.error))
 
 
-def as_good(fitted: Sequence[FittedLaw]) -> list[FittedLaw]:
-    """Laws that are stable where tests have been, whose errors are nearly the smallest of such laws; if none is stable,
-    the same of all.
-    """
+def _alike(fitted: Sequence[FittedLaw], factor: float) -> list[FittedLaw]:
+    """Laws that are stable where tests have been, with errors up to a factor of the smallest; of all if none is."""
     stable = [each for each in fitted if not each.unstable] or list(fitted)
-    limit = max(ALIKE * min(each.fit.error for each in stable), _SMALL)
+    limit = max(factor * min(each.fit.error for each in stable), _SMALL)
     return [each for each in stable if each.fit.error <= limit]
 
 
 def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> dict[str, float]:
-    """Kind of test that was not made -> by how much laws that fit as well differ there, over their mean.
+    """Kind of test that was not made -> by how much laws that fit about as well differ there, over their mean.
 
     It is the largest difference of their nominal stress at stretches up to the largest first invariant of the tests.
     """
@@ -270,6 +285,6 @@ def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) 
             continue
         stretch = stretches_up_to(kind, most)
         test = MaterialTest(kind, stretch, np.ones(len(stretch)), kind=kind)
-        stresses = np.array([NominalStress(each.fit.material, test)() for each in as_good(fitted)])
+        stresses = np.array([NominalStress(each.fit.material, test)() for each in _alike(fitted, _COMPARED)])
         spread[kind] = float(np.max(np.ptp(stresses, axis=0) / np.abs(stresses.mean(axis=0))))
     return spread

@@ -57,7 +57,7 @@ def write_fit(folder: Path, fitted: Sequence[FittedLaw], tests: Sequence[Materia
     with writing(IdentificationError, folder):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / RESULT).write_text(json.dumps(figures, indent=2) + "\n")
-        (folder / "material.toml").write_text(section_text(recommended(fitted), tests, name))
+        (folder / "material.toml").write_text(section_text(recommended(fitted, tests), tests, name))
         _draw(folder / "fit.png", fitted, tests)
     return figures
 
@@ -67,7 +67,7 @@ def summarise(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> dic
     return {
         "tests": [_test_figures(test) for test in tests],
         "laws": [_law_figures(each) for each in fitted],
-        "recommended": recommended(fitted).name,
+        "recommended": recommended(fitted, tests).name,
         "spread_where_not_tested": untested_spread(fitted, tests),
     }
 
@@ -113,10 +113,9 @@ def _law_figures(each: FittedLaw) -> dict[str, Any]:
 
 def section_text(each: FittedLaw, tests: Sequence[MaterialTest], name: str) -> str:
     """A study's section [materials.NAME], with where it comes from as comments."""
-    listed = ", ".join(f"{t.name} ({t.kind}, stretch {t.stretch.min():.3g} to {t.stretch.max():.3g})" for t in tests)
     lines = [
-        f"# {each.name}, fitted by `morph fit` to {listed}",
-        f"# root mean square error {100.0 * each.fit.error:.2g} % of the root mean square stress",
+        f"# {each.name}, fitted by `morph fit`: error {100.0 * each.fit.error:.2g} % of the root mean square stress of",
+        *(f"# {t.name} ({t.kind}, stretch {t.stretch.min():.3g} to {t.stretch.max():.3g})" for t in tests),
         f"[materials.{name}]",
     ]
     quantities = constant_quantities(each.fit.material.law)
@@ -160,7 +159,9 @@ def fit_lines(figures: Mapping[str, Any]) -> list[str]:
     wide = {kind: spread for kind, spread in figures["spread_where_not_tested"].items() if spread > _WIDE}
     if wide:
         listed = ", ".join(f"{kind}: {100.0 * spread:.0f} %" for kind, spread in wide.items())
-        said.append(f"note: laws that fit as well differ where nothing was measured ({listed}); test that as well")
+        said.append(
+            f"note: laws that fit about as well differ where nothing was measured ({listed}); test that as well"
+        )
     return said
 
 
@@ -189,11 +190,11 @@ def _constant_line(constant: Mapping[str, Any]) -> str:
     if deviation is None:
         return f"{name} = {value / scale:.4g}{unit}, not determined by these tests"
     half = _HALF_INTERVAL * deviation
-    weak = "; these tests hardly determine it" if half > abs(value) else ""
-    return (
-        f"{name} = {value / scale:.4g}{unit}, 95 % interval {(value - half) / scale:.4g} to "
-        f"{(value + half) / scale:.4g}{unit}{weak}"
-    )
+    low, weak = value - half, "; these tests hardly determine it" if half > abs(value) else ""
+    if name.startswith(("modulus", "limit", "share", "time")):
+        low = max(low, 0.0)
+    low, high = low / scale, (value + half) / scale
+    return f"{name} = {value / scale:.4g}{unit}, 95 % interval {low:.4g} to {high:.4g}{unit}{weak}"
 
 
 def fit_last_line(figures: Mapping[str, Any]) -> str:
@@ -208,7 +209,7 @@ def fit_last_line(figures: Mapping[str, Any]) -> str:
 def _draw(path: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> None:
     """Measured points and computed curves, a panel for each kind of test; kinds that were not made show the spread."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
-    best = recommended(fitted)
+    best = recommended(fitted, tests)
     most = max(float(test.first_invariant.max()) for test in tests)
     for place, kind in enumerate(KINDS, start=1):
         axes = figure.add_subplot(1, len(KINDS), place)
@@ -245,9 +246,10 @@ def _draw_over_stretch(
 
 
 def _draw_in_time(axes: Axes, best: FittedLaw, tests: Sequence[MaterialTest], kind: str) -> None:
+    labels = ("measured", best.name)
     for test, computed in zip(tests, best.fit.computed, strict=True):
-        if test.kind == kind:
-            along = test.stretch if test.time is None else test.time
-            axes.plot(along, test.stress / _MEGAPASCAL, ".", color="0.3", label=test.name)
-            axes.plot(along, computed / _MEGAPASCAL, lw=1.6, label=best.name)
+        if test.kind == kind and test.time is not None:
+            axes.plot(test.time - test.time[0], test.stress / _MEGAPASCAL, ".", color="0.5", ms=4, label=labels[0])
+            axes.plot(test.time - test.time[0], computed / _MEGAPASCAL, color="tab:red", lw=1.4, label=labels[1])
+            labels = ("", "")
     axes.set_xlabel("time, s")
