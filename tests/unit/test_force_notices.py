@@ -29,6 +29,8 @@ def notices(measured, frames=CYCLES, arches=ARCHES, name="force_N", run=None):
         ("force_g", 0.8 * 9.80665e-3, "N", 0.8),
         ("force [N]", 0.8e-3, "kN", 0.8),
         ("force", 25.0, "", 25.0),
+        ("force_N", 1.05 / 9.80665, "kg", 1.05),
+        ("force_N", 1.0 / 4.4482216152605, "lb", 1.0),
     ],
 )
 def test_forces_in_another_unit_are_named(name, factor, unit, then):
@@ -41,7 +43,7 @@ def test_forces_in_another_unit_are_named(name, factor, unit, then):
     assert ("with values in" in other["text"]) == bool(unit)
 
 
-@pytest.mark.parametrize("factor", [0.2, 1.0, 1.25, 8.0])
+@pytest.mark.parametrize("factor", [0.15, 0.2, 0.4, 1.0, 1.25, 8.0])
 def test_a_model_whose_moduli_are_off_is_not_accused_of_units(factor):
     assert notices(factor * pull(ARCHES)) == {}
 

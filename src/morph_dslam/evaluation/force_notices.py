@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 #: Forces that change by more than so many times as much as the model's, or less than its inverse, are others. In the
 #: unit that is meant, they change as the model's do up to the other factor: its moduli may be wrong.
 MOST_FACTOR, ALIKE = 10.0, 2.0
+#: From here on a unit is offered, if only one would do: kgf and lbf lie within the other limit.
+DOUBTED_FACTOR = 3.0
 #: How likely independent residuals may be as alike as those of which it is said. Residuals below the last part of what
 #: the load changed are not looked at.
 LEAST_PROBABILITY, LEAST_MISSED = 1e-3, 1e-3
@@ -37,7 +39,7 @@ class ForceNotice(Notice):
 
 @dataclass(frozen=True)
 class OtherSize(ForceNotice):
-    """They change by far more or less than the model's.
+    """They change by far more or less than the model's, or by a factor that one other unit explains.
 
     Attributes
     ----------
@@ -56,12 +58,18 @@ class OtherSize(ForceNotice):
     @classmethod
     def of(cls, name: str, factor: float) -> OtherSize | None:
         """The notice of a factor, if it needs one."""
-        if not factor > 0.0 or 1.0 / MOST_FACTOR <= factor <= MOST_FACTOR:
+        if not factor > 0.0 or 1.0 / DOUBTED_FACTOR <= factor <= DOUBTED_FACTOR:
             return None
         factors = {unit: factor * newtons / newtons_of(name) for unit, newtons in FORCE_UNITS.items()}
         unit = min(factors, key=lambda unit: (abs(np.log(factors[unit])), len(unit)))
-        is_meant = 1.0 / ALIKE <= factors[unit] <= ALIKE
-        return cls(name, factor, unit if is_meant else "", factors[unit] if is_meant else factor)
+        meant = {FORCE_UNITS[unit] for unit, with_unit in factors.items() if 1.0 / ALIKE <= with_unit <= ALIKE}
+        found = cls(name, factor, unit if meant else "", factors[unit] if meant else factor)
+        return found if found.is_far or len(meant) == 1 else None
+
+    @property
+    def is_far(self) -> bool:
+        """Whether moduli do not explain the factor either; a model of placeholder moduli may have a smaller one."""
+        return not 1.0 / MOST_FACTOR <= self.factor <= MOST_FACTOR
 
     @property
     def finding(self) -> str:
@@ -71,6 +79,8 @@ class OtherSize(ForceNotice):
 
     @property
     def text(self) -> str:
+        if not self.is_far:
+            return f"{self.finding}: that unit may be meant, or the moduli of the model are others"
         return self.template.format(finding=self.finding)
 
 

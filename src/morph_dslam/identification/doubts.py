@@ -32,10 +32,10 @@ def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0) ->
     Raises
     ------
     IdentificationError
-        If a factor of the prediction that would fit is that of `OtherSize`.
+        If a factor of the prediction that would fit is far, as `OtherSize` has it.
     """
     factor = size_factor(forces, predicted)
-    if factor is not None and (other := OtherSize.of(forces.name, factor)):
+    if factor is not None and (other := OtherSize.of(forces.name, factor)) and other.is_far:
         of_model = OtherSize.of(forces.name, moduli * factor) or other
         raise IdentificationError(
             f"{of_model.finding}, and nothing in the model's ranges explains it: check the units of its columns and "
