@@ -15,10 +15,12 @@ from morph_dslam.evaluation.depth import depth_error, read_depths, summarise_dep
 from morph_dslam.evaluation.force import force_error, summarise_force
 from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from morph_dslam.evaluation.frame_numbers import point_notes, track_notes
+from morph_dslam.evaluation.picture_axes import axes_notes
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
 from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.trajectory import summarise_alignment
+from morph_dslam.evaluation.truth_in_camera import check_truth
 from morph_dslam.io.writing import writing
 
 # What draws is imported where it draws: matplotlib takes long to load.
@@ -47,11 +49,12 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
     """
     tracked = run if isinstance(run, Run) else load_run(run)
     points = truth if isinstance(truth, PointTruth) else load_truth(Path(truth))
+    notes = check_truth(tracked, points, bind_frame)
     error = material_error(tracked, points, bind_frame)
     figures = {
         **summarise(error),
         **summarise_alignment(error),
-        "notes": point_notes(tracked, points, error),
+        "notes": [*notes, *point_notes(tracked, points, error)],
         "truth": None if isinstance(truth, PointTruth) else str(truth),
         **_counts(tracked),
         "median_ms": float(np.nanmedian(tracked.frame_times)),
@@ -142,7 +145,10 @@ def evaluate_pixels(
     error = pixel_error(tracked, measured, bind_frame)
     figures = {
         **summarise_pixels(error),
-        "notes": track_notes(tracked, measured, error, bind_frame),
+        "notes": [
+            *axes_notes(tracked, measured, error, bind_frame),
+            *track_notes(tracked, measured, error, bind_frame),
+        ],
         "tracks": None if isinstance(tracks, PixelTracks) else str(tracks),
         **_counts(tracked),
     }

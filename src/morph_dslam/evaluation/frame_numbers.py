@@ -44,7 +44,7 @@ def point_notes(run: Run, truth: PointTruth, error: MaterialError) -> list[str]:
     error : as it was found.
     """
     bind_frame = error.binding.frame
-    rows = np.isin(truth.frames, [bind_frame, *_some(error.frames)])
+    rows = np.isin(truth.frames, [bind_frame, *spread_over(error.frames)])
     few = PointTruth(truth.frames[rows], truth.points[rows], truth.pixels[rows], truth.hidden[rows])
 
     def mean_error(shift: int) -> float:
@@ -56,7 +56,7 @@ def point_notes(run: Run, truth: PointTruth, error: MaterialError) -> list[str]:
 
 def track_notes(run: Run, tracks: PixelTracks, error: PixelError, bind_frame: int | None = None) -> list[str]:
     """What other numbers of the tracks' frames explain, if they do; ``error`` is what `pixel_error` found."""
-    rows = np.isin(tracks.frames, [*error.bind_frames, *_some(error.frames)])
+    rows = np.isin(tracks.frames, [*error.bind_frames, *spread_over(error.frames)])
     few = PixelTracks(tracks.ids, tracks.frames[rows], tracks.pixels[rows])
 
     def mean_error(shift: int) -> float:
@@ -67,7 +67,7 @@ def track_notes(run: Run, tracks: PixelTracks, error: PixelError, bind_frame: in
     return _notes(mean_error, "the tracks", "px")
 
 
-def _some(frames: NDArray[np.int64]) -> NDArray[np.int64]:
+def spread_over(frames: NDArray[np.int64]) -> NDArray[np.int64]:
     """`COMPARED` of them, spread over all."""
     return frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).astype(int))]
 

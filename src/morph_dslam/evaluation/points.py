@@ -81,8 +81,6 @@ def load_truth(path: str | Path) -> PointTruth:
     return PointTruth(frames.astype(np.int64), points, pixels.astype(float), ~visible)
 
 
-#: Distances that differ by more than this factor are in another unit.
-OTHER_UNIT = 100.0
 #: A truth point whose pixel misses the estimated surface by no more than this is bound to its outline.
 OUTLINE_TOLERANCE_PX = 5.0
 
@@ -203,24 +201,9 @@ def bind_truth(run: Run, truth: PointTruth, frame: int) -> Binding:
     bound = points.triangles >= 0
     if not bound.any():
         raise EvaluationError(f"in frame {frame} no truth pixel falls on the estimated surface")
-    _check_unit(run, row, truth.points[in_truth[0]])
     unbound = np.setdiff1d(np.arange(recorded.shape[0]), columns[bound])
     n_unseen = len(recorded) - len(columns)
     return Binding(frame, columns[bound], points.take(bound), n_outline, unbound, n_unseen)
-
-
-def _check_unit(run: Run, row: int, points: Array) -> None:
-    """Refuse points (p, 3) a thousand times nearer or farther than the object is in a row of the run."""
-    measured = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
-    if not measured.size:
-        return
-    estimated = float(np.median(np.linalg.norm(run.camera_points(row), axis=1)))
-    ratio = float(np.median(measured)) / estimated
-    if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT:
-        raise EvaluationError(
-            f"the truth's points are {1e3 * np.median(measured):.3g} mm from the camera in frame {run.frames[row]}, "
-            f"and the run has the object at {1e3 * estimated:.3g} mm: give points_mm in mm, in the camera frame"
-        )
 
 
 def material_error(run: Run, truth: PointTruth, bind_frame: int | None = None) -> MaterialError:
