@@ -87,6 +87,26 @@ def test_tracks_that_count_from_another_frame_are_named():
     assert evaluate_pixels(run, tracks(noisy))["notes"] == []
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda p: np.stack([639.0 - p[..., 0], p[..., 1]], axis=-1), "have u counted from the right"),
+        (lambda p: np.array([639.0, 479.0]) - p, "have u"),
+    ],
+)
+def test_tracks_with_other_axes_or_of_another_picture_are_named(change, said):
+    (note,) = evaluate_pixels(sliding_run(), tracks(change(projected())))["notes"]
+    assert f"if their pixels {said}: the mean error is " in note
+
+
+def test_right_tracks_name_no_axes_however_wrong_the_run():
+    """A run that stands still, or slides half as far, is wrong by itself."""
+    for share in (0.0, 0.5, 1.5):
+        run = sliding_run()
+        run.camera_from_object[:, 0, 3] *= share
+        assert evaluate_pixels(run, tracks(projected()))["notes"] == []
+
+
 def test_pixels_are_those_of_the_image_as_recorded():
     """One radial term moves the second track by 3 px and more."""
     camera = md.Camera(640, 480, 528.0, 528.0, 320.0, 240.0, distortion=(-0.2, 0.0, 0.0, 0.0))

@@ -37,7 +37,11 @@ def turned(points, degrees):
         (lambda x: x / 25.4, None, r"points_mm in mm \(times 25\.4\)"),
         (lambda x: x / 1000.0, None, r"points_mm in mm \(times 1000\)"),
         (lambda x: x * 10.0, None, r"points_mm in mm \(times 0\.1\)"),
-        (lambda x: x * OPENGL, None, r"60 of 60 .* not in front of the camera .* fit them if y, z of points_mm are neg"),
+        (
+            lambda x: x * OPENGL,
+            None,
+            r"60 of 60 .* not in front of the camera .* fit them if y, z of points_mm are neg",
+        ),
         (lambda x: x * OPENGL / 1000.0, None, "y, z of points_mm are negated"),
         (lambda x: x * [1.0, -1.0, 1.0], None, "y of points_mm is negated or if the pixels have v counted from below"),
         (lambda x: x * [-1.0, 1.0, 1.0], None, "x of points_mm is negated"),

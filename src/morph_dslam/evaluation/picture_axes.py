@@ -18,6 +18,10 @@ Array = NDArray[np.float64]
 #: A change is named if with it the error is so many times less, and less by so many pixels. A bar that is stretched
 #: looks much the same upside down: there the wrong axis makes five times the error.
 CLEARLY, LEAST_PX = 4.0, 2.0
+#: Another size is named only if so many times more tracks begin on the object with it: a run that moves too little or
+#: too much also leaves less with scaled tracks.
+MORE_BEGIN = 1.25
+SIZES = ("are those of a picture of half the size", "are those of a picture of double the size")
 
 
 def picture_changes(camera: Camera) -> dict[str, Callable[[Array], Array]]:
@@ -28,8 +32,8 @@ def picture_changes(camera: Camera) -> dict[str, Callable[[Array], Array]]:
         "have u counted from the right": lambda pixels: np.stack([last[0] - pixels[..., 0], pixels[..., 1]], axis=-1),
         "have u and v counted from the other corner": lambda pixels: last - pixels,
         "have u and v exchanged": lambda pixels: pixels[..., ::-1],
-        "are those of a picture of half the size": lambda pixels: 2.0 * pixels + 0.5,
-        "are those of a picture of double the size": lambda pixels: (pixels - 0.5) / 2.0,
+        SIZES[0]: lambda pixels: 2.0 * pixels + 0.5,
+        SIZES[1]: lambda pixels: (pixels - 0.5) / 2.0,
     }
 
 
@@ -47,15 +51,16 @@ def axes_notes(run: Run, tracks: PixelTracks, error: PixelError, bind_frame: int
     few = PixelTracks(tracks.ids, tracks.frames[rows], tracks.pixels[rows])
     n_begin = max(len(error.ids), (len(tracks.ids) + 1) // 2)
 
-    def mean_error(change: Callable[[Array], Array]) -> float:
+    def mean_error(words: str, change: Callable[[Array], Array]) -> float:
         try:
             changed = pixel_error(run, replace(few, pixels=change(few.pixels)), bind_frame)
         except EvaluationError:  # nothing can be compared
             return np.inf
-        return float(np.nanmean(changed.distances_px)) if len(changed.ids) >= n_begin else np.inf
+        fewest = max(n_begin, MORE_BEGIN * len(error.ids)) if words in SIZES else n_begin
+        return float(np.nanmean(changed.distances_px)) if len(changed.ids) >= fewest else np.inf
 
     given = float(np.nanmean(error.distances_px))
-    errors = {words: mean_error(change) for words, change in picture_changes(run.camera).items()}
+    errors = {words: mean_error(words, change) for words, change in picture_changes(run.camera).items()}
     best = min(errors, key=lambda words: errors[words])
     if not given > max(CLEARLY * errors[best], errors[best] + LEAST_PX):
         return []

@@ -106,7 +106,8 @@ def _check_axes(camera: Camera, points: Array, pixels: Array, where: str) -> lis
     if 2 * n_behind > len(points):
         what = f"{where} {n_behind} of {len(points)} truth points are not in front of the camera (z <= 0), where their pixels are"
     if explained := _explanations(camera, points, pixels, gap):
-        raise EvaluationError(f"{what}, and fit them if {' or if '.join(explained)}: correct the file; {WHAT_IT_IS}")
+        changes = " or if ".join(explained)
+        raise EvaluationError(f"{what}, and fit them if {changes}: correct the file; {WHAT_IT_IS}")
     if gap > ELSEWHERE * np.hypot(camera.width, camera.height):
         raise EvaluationError(
             f"{what}: points and pixels do not belong together in this camera. Give both of this camera; {WHAT_IT_IS}"
