@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 CLEARLY, LEAST_PX = 4.0, 2.0
 #: Another size is named only if so many times more tracks begin on the object with it: a run that moves too little or
 #: too much also leaves less with scaled tracks.
-MORE_BEGIN = 1.25
+MORE_BEGIN = 1.6
 SIZES = ("are those of a picture of half the size", "are those of a picture of double the size")
 
 

@@ -104,7 +104,7 @@ def _check_axes(camera: Camera, points: Array, pixels: Array, where: str) -> lis
         return []
     what = f"{where} the truth's points, projected by the run's camera, lie {gap:.3g} px (median) from their pixels"
     if 2 * n_behind > len(points):
-        what = f"{where} {n_behind} of {len(points)} truth points are not in front of the camera (z <= 0), where their pixels are"
+        what = f"{where} {n_behind} of {len(points)} truth points are not in front of the camera (z <= 0)"
     if explained := _explanations(camera, points, pixels, gap):
         changes = " or if ".join(explained)
         raise EvaluationError(f"{what}, and fit them if {changes}: correct the file; {WHAT_IT_IS}")
