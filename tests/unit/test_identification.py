@@ -127,6 +127,18 @@ def test_forces_outside_of_the_models_range_are_left_out() -> None:
         MeasuredForces(model, ForceCurve("a", 2.0 + places, measured), reaction)
 
 
+def test_a_smaller_unit_with_which_all_forces_are_inside_is_offered() -> None:
+    """Millimetres whose title says centimetres: nine of ten are beyond the range of 1 m."""
+    model, places = plate(), np.linspace(0.0, 0.9, 91)
+    stroke = replace(model, parameters=tuple(replace(p, quantity="length", unit="m") for p in model.parameters))
+    reaction = reaction_in_direction(stroke, "edge:z")
+    assert MeasuredForces(stroke, ForceCurve("a", places, 80.0 * places), reaction).smaller_unit is None
+    table = MeasuredForces(stroke, ForceCurve("a", 10.0 * places, 80.0 * places), reaction)
+    assert table.smaller_unit == pytest.approx(0.1)
+    said = "\n".join(identification_lines(summarise(identify(stroke, [table], moduli=True))))
+    assert "with 0.1 times its places all would be inside: is the unit in the title right?" in said
+
+
 def stating(certificate: dict[str, Any]) -> ReducedModel:
     return replace(plate(), certificate=certificate)
 

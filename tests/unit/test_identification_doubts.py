@@ -85,23 +85,27 @@ def test_another_law_is_seen_from_neighbouring_residuals() -> None:
     assert "neighbouring residuals of force are alike" in lines(found)
 
 
-@pytest.mark.parametrize(
-    ("name", "factor", "unit"),
-    [("force_g", 0.8 * 9.80665e-3, "N"), ("force", 1.25 / 9.80665e-3, "g"), ("force", 30, "")],
-)
-def test_a_factor_of_all_moduli_that_a_unit_explains_is_doubted(name: str, factor: float, unit: str) -> None:
-    """One of 127 is beyond the range that is searched, but its size is found from the forces."""
-    right = forces(factor * of_law(0.0) + 3.0)
-    table = replace(right, curve=replace(right.curve, name=name))
+def test_a_factor_of_all_moduli_that_no_unit_explains_is_doubted() -> None:
+    table = forces(30.0 * of_law(0.0) + 3.0)
     figures = summarise(identify(table.model, [table], moduli=True))
     (notice,) = figures["measurements"][0]["notices"]
-    assert (notice["kind"], notice["unit"]) == ("other_size", unit)
-    assert notice["factor"] == pytest.approx(factor, rel=1e-4)
-    at_end = "note: moduli_factor is at the end of its range, 0.01 to 100 for every model: check units"
-    text = "\n".join(identification_lines(figures))
-    is_beyond = not 0.01 < factor < 100.0
-    assert (at_end in text) == is_beyond
-    assert ("without an interval" in text) == is_beyond
+    assert (notice["kind"], notice["unit"]) == ("other_size", "")
+    assert notice["factor"] == pytest.approx(30.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "says"),
+    [
+        ("force_g", 0.8 * 9.80665e-3, r"0\.007845 times .* with values in N it would be 0\.8 times"),
+        ("force", 1.25 / 9.80665e-3, r"127\.5 times .* with values in g it would be 1\.25 times"),
+    ],
+)
+def test_a_factor_of_all_moduli_beyond_its_range_is_refused(name: str, factor: float, says: str) -> None:
+    """At the end of 0.01 to 100 it is no estimate, even where what is left is less than ten times."""
+    right = forces(factor * of_law(0.0) + 3.0)
+    table = replace(right, curve=replace(right.curve, name=name))
+    with pytest.raises(IdentificationError, match=says):
+        identify(table.model, [table], moduli=True)
 
 
 def test_forces_in_other_units_are_refused_with_the_unit_that_is_meant() -> None:

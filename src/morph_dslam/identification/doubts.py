@@ -24,10 +24,11 @@ def size_factor(forces: MeasuredForces, predicted: Array) -> float | None:
     return float(modelled @ forces.changes) / size
 
 
-def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0) -> None:
+def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0, at_end: bool = False) -> None:
     """Refuse forces that change by far more or less than predicted ones (n,), those that fit best.
 
-    ``moduli`` is the common factor of all moduli in the predictions.
+    ``moduli`` is the common factor of all moduli in the predictions, and ``at_end`` whether it is at an end of its
+    range: then it has taken up what it could.
 
     Raises
     ------
@@ -35,8 +36,12 @@ def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0) ->
         If a factor of the prediction that would fit is far, as `OtherSize` has it.
     """
     factor = size_factor(forces, predicted)
-    if factor is not None and (other := OtherSize.of(forces.name, factor)) and other.is_far:
-        of_model = OtherSize.of(forces.name, moduli * factor) or other
+    if factor is None:
+        return
+    of_model = OtherSize.of(forces.name, moduli * factor)
+    other = of_model if at_end else OtherSize.of(forces.name, factor)
+    if other is not None and other.is_far:
+        of_model = of_model or other
         raise IdentificationError(
             f"{of_model.finding}, and nothing in the model's ranges explains it: check the units of its columns and "
             "--reaction, or build the model with wider ranges"

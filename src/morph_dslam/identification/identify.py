@@ -188,7 +188,9 @@ def identify(
         # Only now, for the sign of a force may depend on what is identified.
         if isinstance(misfit.measurement, MeasuredForces):
             misfit.measurement.compared.check_growth(misfit.predicted, misfit.measurement.values)
-            check_size(misfit.measurement, misfit.predicted, found[FACTOR].value if moduli else 1.0)
+            factor = found[FACTOR] if moduli else None
+            taken, at_end = (1.0, False) if factor is None else (factor.value, factor.at_bound)
+            check_size(misfit.measurement, misfit.predicted, taken, at_end)
     return found
 
 

@@ -419,6 +419,20 @@ class MeasuredForces:
         return len(self.curve.places) - len(self._rows)
 
     @property
+    def smaller_unit(self) -> float | None:
+        """What the places have to be multiplied by to lie in the model's range all, where most of them do not; None if
+        no smaller unit does that.
+        """
+        if self._against is None or 2 * self.left_out <= len(self.curve.places):
+            return None
+        units = FACTORS[self._against.quantity].values()
+        # The largest first: a unit that leaves them all near zero would do as well.
+        for scale in sorted({a / b for a in units for b in units if a < b}, reverse=True):
+            if all(self._against.in_range(scale * place) for place in self.curve.places):
+                return scale
+        return None
+
+    @property
     def why_left_out(self) -> str:
         """What those are, for people."""
         if self._against is None:

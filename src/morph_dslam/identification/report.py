@@ -99,6 +99,7 @@ def _force_figures(
         "share_of_range": forces.share_of_range,
         "lines_without_force": forces.curve.empty,
         "left_out": forces.left_out,
+        "inside_with_places_times": forces.smaller_unit,
         "loading_rate_per_frame": {f"{n}_{units[n].unit}": units[n].display(rate) for n, rate in rates},
         "neighbours": None if alike is None else asdict(alike),
         "notices": [notice.content() for notice in found],
@@ -147,8 +148,6 @@ def _parameter_lines(each: Mapping[str, Any], measurements: Sequence[Mapping[str
     said, weak = [f"{name} = {each['value']:.4g}{unit}, {interval}"], _weak(each, measurements)
     if each["at_bound"]:
         advice = "" if each["as_wide_as_range"] or weak else ": the model may need a wider one"
-        if name == FACTOR:
-            advice = f", {lower:g} to {upper:g} for every model: check units, and the moduli of the model"
         said.append(f"note: {name} is at the end of its range{advice}")
     if each["as_wide_as_range"]:
         said.append(f"note: {name} could not be identified: its interval is as wide as its range")
@@ -201,7 +200,11 @@ def _measurement_lines(each: Mapping[str, Any]) -> list[str]:
     said.append(f"note: {name} is compared with {reaction_remark(each)}")
     if each["left_out"]:
         of = each["left_out"] + each["values"]
-        said.append(f"note: {each['left_out']} of {of} forces of {name} are left out: {each['why']}")
+        scale = each["inside_with_places_times"]
+        unit = (
+            f"; with {scale:.3g} times its places all would be inside: is the unit in the title right?" if scale else ""
+        )
+        said.append(f"note: {each['left_out']} of {of} forces of {name} are left out: {each['why']}{unit}")
     if each["lines_without_force"]:
         said.append(f"note: {name} is empty in {each['lines_without_force']} lines of its file")
     rate = ", ".join(f"{name} {rate:.3g} a frame" for name, rate in each["loading_rate_per_frame"].items())

@@ -54,8 +54,8 @@ class RunWarning(StrEnum):
     )
     FEW_AGREE = (
         "few points agree, and less closely than usual, in {count} of {n_frames} frames, first in frame {first}: "
-        "something is before the object, it deforms otherwise than the model, or it was taken for what looks like it; do "
-        "not rely on these frames"
+        "something is before the object, it deforms otherwise than the model, or it was taken for what looks like it; "
+        "do not rely on these frames"
     )
     SAME_PLACE = (
         "it stands where '{other}' stands in {count} of {n_frames} frames, first in frame {first}: one of both was "
