@@ -22,6 +22,8 @@ from morph_dslam.model.reduced_model import ReducedModel
 Array = NDArray[np.float64]
 #: The certificate's entry of the held-out solutions, and there that of the products of errors and modes.
 HELD_OUT, ON_MODES = "held_out", "error_on_modes_m2"
+#: Variance of a parameter that is somewhere in its range, over the range squared: that of a uniform distribution.
+UNKNOWN = 1.0 / 12.0
 
 
 def errors_on_modes(model: ReducedModel, errors: Iterable[Array]) -> list[list[float]]:
@@ -77,6 +79,10 @@ class ReductionErrors:
     def covariance(self, mu: Array, constant: NDArray[np.bool_]) -> Array:
         """Covariance (d, d) of the parameters at a state, SI.
 
+        With D the effects, e the error and r its size, the parameters are off by (D'D + r^2)^-1 D'e. What that leaves
+        out is how far they are from where they are taken without evidence, r^2 (D'D + r^2)^-1 of it: one that moves the
+        surface by less than the error is anywhere in its range.
+
         Parameters
         ----------
         mu : (d,) the state, SI.
@@ -88,7 +94,8 @@ class ReductionErrors:
         inverse = self._inverse(effects[free])
         found = np.zeros((len(mu), len(mu)))
         errors = inverse @ effects[free] @ self.on_modes.T
-        found[np.ix_(free, free)] = errors @ errors.T / errors.shape[1]
+        unknown = self.least * inverse
+        found[np.ix_(free, free)] = errors @ errors.T / errors.shape[1] + UNKNOWN * unknown @ unknown.T
         # What a constant is off by, the others make good as far as they can.
         taken = np.eye(len(mu))[:, constant]
         taken[free] = -inverse @ effects[free] @ self.products @ effects[constant].T
@@ -102,8 +109,12 @@ class ReductionErrors:
     def _inverse(self, effects: Array) -> Array:
         """Of the parameters' normal matrix (d, d); one that moves the surface by less than the error is unknown."""
         normal = effects @ self.products @ effects.T
-        least = max(self.size**2, np.finfo(float).tiny)
-        return np.asarray(np.linalg.inv(normal + least * np.eye(len(normal))), dtype=np.float64)
+        return np.asarray(np.linalg.inv(normal + self.least * np.eye(len(normal))), dtype=np.float64)
+
+    @property
+    def least(self) -> float:
+        """Squared movement of the surface, square metres, below which the error hides a parameter."""
+        return max(self.size**2, float(np.finfo(float).tiny))
 
     @cached_property
     def _of_constants(self) -> Array:

@@ -1,4 +1,4 @@
-"""What a model's certificate says of the errors of its stress and forces.
+"""What a model's certificate says of the errors of its displacement, stress and forces.
 
 A displacement may be reduced well where stress and forces are not: in thin shells a small error of the shape strains
 the middle surface, which is stiff.
@@ -12,7 +12,7 @@ import numpy as np
 
 from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION, ReducedModel
 
-#: Stress and forces that the reduction misses by more than this part are not to be relied on.
+#: Displacements, stress and forces that the reduction misses by more than this part are not to be relied on.
 MOST = 0.1
 #: The certificate's entries, within that of the discretisation, of why it has no error, and whether it can have one.
 NOT_ESTIMATED, ESTIMABLE = "not_estimated", "estimable"
@@ -30,7 +30,12 @@ def doubtful_errors(model: ReducedModel) -> dict[str, float]:
     reactions = {name: stated.get(REACTION + name, {}) for name in model.reactions}
     forces = [(entry, "largest_N", 1.0) for name, entry in reactions.items() if name.startswith(FORCE)]
     moments = [(entry, "largest_Nmm", 1e-3 / size) for name, entry in reactions.items() if name.startswith(MOMENT)]
-    kinds = {"von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stresses], "forces": [*forces, *moments]}
+    moved = [(stated.get("displacement", {}), "largest_mm", 1.0)]
+    kinds = {
+        "displacements": moved,
+        "von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stresses],
+        "forces": [*forces, *moments],
+    }
     errors = {kind: _largest(entries) for kind, entries in kinds.items()}
     return {kind: error for kind, error in errors.items() if error > MOST}
 
