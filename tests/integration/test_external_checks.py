@@ -82,6 +82,11 @@ def made(folder):
     return load_model(folder / "x.morph"), model.certificate.get("warnings", [])
 
 
+def doubted_rows(folder):
+    """The warnings that name a row of the table; that such models miss much of what they are made of is another one."""
+    return [warning for warning in made(folder)[1] if warning.startswith("table.csv")]
+
+
 def moved(number, *state):
     """A cubic displacement only."""
     pull, shear = state[:2]
@@ -207,7 +212,7 @@ def with_one(change, at=9):
 def test_one_wrong_solution_is_named_and_no_other(tmp_path, change, message):
     states = np.vstack([scattered(), [[0.05, -0.1], [0.05, 0.3], [0.4, -0.1], [0.4, 0.3]]])
     states[9] = [0.3, 0.2]  # between the others, and moved far
-    (warning,) = made(write(tmp_path, states, with_one(change)))[1]
+    (warning,) = doubted_rows(write(tmp_path, states, with_one(change)))
     assert warning.startswith(f"table.csv, line 11, 's9.vtu': {message}")
 
 
@@ -217,7 +222,7 @@ def test_two_rows_with_the_parameters_of_each_other_are_named(tmp_path):
     swapped = states.copy()
     swapped[[4, 5]] = states[[5, 4]]
     folder = write(tmp_path, swapped, lambda number, *_: moved(number, *states[number]))
-    warnings = made(folder)[1]
+    warnings = doubted_rows(folder)
     assert [warning.split(":")[0] for warning in warnings] == [
         "table.csv, line 6, 's4.vtu'",
         "table.csv, line 7, 's5.vtu'",
@@ -238,7 +243,7 @@ def test_steep_right_solutions_are_not_named(tmp_path, size):
     corners = [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
     states = np.vstack([np.random.default_rng(3).random((36, 2)), corners])
     folder = write(tmp_path, states, lambda _, a, b: {"U": (0.02 * a + 0.1 * size((2 * a + b) / 3)) * POINTS})
-    assert made(folder)[1] == []
+    assert doubted_rows(folder) == []
 
 
 def test_states_along_one_history_leave_the_box_empty(tmp_path):
