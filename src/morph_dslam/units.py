@@ -38,6 +38,12 @@ def quantity_of(unit: str) -> str:
     raise StudyError(f"'{unit}' is not a known unit; known are {', '.join(units)}")
 
 
+def smaller_units(quantity: str) -> list[float]:
+    """What makes values of smaller units of those in larger ones, each less than 1, ascending."""
+    units = FACTORS[quantity].values()
+    return sorted({a / b for a in units for b in units if a < b})
+
+
 def to_si(value: float, unit: str, quantity: str) -> float:
     """Convert ``value`` in ``unit`` to SI. Raises StudyError if ``unit`` does not measure ``quantity``."""
     known = FACTORS[quantity]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.frame_numbers import CLEARLY, FEWEST_FORCES, Correction, fit_columns
-from morph_dslam.units import FACTORS
+from morph_dslam.units import smaller_units
 
 Array = NDArray[np.float64]
 
@@ -27,9 +27,8 @@ def place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array
     """
     order = np.argsort(curve.places, kind="stable")
     known, forces = curve.places[order], curve.forces[order]
-    units = FACTORS[quantity].values()
     found = []
-    for scale in sorted({a / b for a in units for b in units if a < b}):
+    for scale in smaller_units(quantity):
         inside = (places >= scale * known[0]) & (places <= scale * known[-1])
         if inside.sum() < FEWEST_FORCES:
             continue

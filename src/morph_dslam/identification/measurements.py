@@ -27,7 +27,7 @@ from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_
 from morph_dslam.model.parameter_errors import ParameterErrors
 from morph_dslam.model.stated_errors import force_error
 from morph_dslam.tracking.binding import nearest_surface_points
-from morph_dslam.units import FACTORS
+from morph_dslam.units import FACTORS, smaller_units
 
 Array = NDArray[np.float64]
 #: Columns of a table of points: the state, where they are on the undeformed object, and where they were measured.
@@ -425,9 +425,8 @@ class MeasuredForces:
         """
         if self._against is None or 2 * self.left_out <= len(self.curve.places):
             return None
-        units = FACTORS[self._against.quantity].values()
         # The largest first: a unit that leaves them all near zero would do as well.
-        for scale in sorted({a / b for a in units for b in units if a < b}, reverse=True):
+        for scale in reversed(smaller_units(self._against.quantity)):
             if all(self._against.in_range(scale * place) for place in self.curve.places):
                 return scale
         return None

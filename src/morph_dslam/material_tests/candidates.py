@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.material_tests.fit import Bounds, Fit, fit_law
-from morph_dslam.material_tests.nominal_stress import KINDS, MaterialTest, NominalStress
+from morph_dslam.material_tests.nominal_stress import KINDS, MaterialTest, NominalStress, largest_invariant
 from morph_dslam.material_tests.stability import first_unstable_stretches, stretches_up_to
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.isotropic import ArrudaBoyce, Gent, MooneyRivlin, Ogden, Yeoh
@@ -60,7 +60,7 @@ class Span:
         """That of tests; raises IdentificationError as `neo_hookean_shear`."""
         return cls(
             neo_hookean_shear(tests),
-            max(float(test.first_invariant.max()) for test in tests),
+            largest_invariant(tests),
             all(test.kind == "uniaxial" and np.min(test.stretch) > _COMPRESSED for test in tests),
         )
 
@@ -277,7 +277,7 @@ def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) 
 
     It is the largest difference of their nominal stress at stretches up to the largest first invariant of the tests.
     """
-    most = max(float(test.first_invariant.max()) for test in tests)
+    most = largest_invariant(tests)
     made = {test.kind for test in tests}
     spread = {}
     for kind in KINDS:

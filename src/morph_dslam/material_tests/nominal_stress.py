@@ -9,7 +9,9 @@ advance in time by the recurrence of `viscous_history`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import ngsolve as ngs
 import numpy as np
@@ -80,6 +82,26 @@ class MaterialTest:
         return np.square(self.principal_stretches).sum(axis=1)
 
 
+def fields_in_cells(values: Array) -> tuple[list[Any], Any]:
+    """A field for each column of ``values`` (n, k), constant in n cells, and the points of a mesh in these cells.
+
+    So one evaluation of an expression of the fields, at the points, carries all rows through.
+    """
+    n = len(values)
+    mesh = Make1DMesh(n)
+    fields = []
+    for column in values.T:
+        field = ngs.GridFunction(ngs.L2(mesh, order=0))
+        field.vec.FV().NumPy()[:] = column
+        fields.append(field)
+    return fields, mesh((np.arange(n) + 0.5) / n)
+
+
+def largest_invariant(tests: Sequence[MaterialTest]) -> float:
+    """The largest first invariant that was measured."""
+    return max(float(test.first_invariant.max()) for test in tests)
+
+
 class NominalStress:
     """Nominal stress of a law in a test; the law's parameters may change between calls.
 
@@ -94,19 +116,10 @@ class NominalStress:
         self.stretch = np.asarray(test.stretch, dtype=float)
         self._time = None if test.time is None else np.asarray(test.time, dtype=float)
         self._free = test.principal_stretches[:, 2]
-        n = len(self.stretch)
-        mesh = Make1DMesh(n)
-        # One cell for each stretch: fields constant in cells carry them all through one evaluation.
-        stretches = []
-        for values in test.principal_stretches.T:
-            field = ngs.GridFunction(ngs.L2(mesh, order=0))
-            field.vec.FV().NumPy()[:] = values
-            stretches.append(field)
-        first, second, third = stretches
+        (first, second, third), self._points = fields_in_cells(test.principal_stretches)
         F = ngs.CF((first, 0, 0, 0, second, 0, 0, 0, third), dims=(3, 3)).MakeVariable()
         stress = ngs.Inv(F) * material.parts(F)[0].Diff(F)
         self._components = ngs.CF((stress[0, 0], stress[2, 2])).Compile()
-        self._points = mesh((np.arange(n) + 0.5) / n)
 
     def __call__(self) -> Array:
         """(n,) nominal stress, Pa."""

@@ -16,7 +16,7 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
 from morph_dslam.material_tests.candidates import FittedLaw, recommended, untested_spread
-from morph_dslam.material_tests.nominal_stress import KINDS, MaterialTest, NominalStress
+from morph_dslam.material_tests.nominal_stress import KINDS, MaterialTest, NominalStress, largest_invariant
 from morph_dslam.material_tests.stability import stretches_up_to
 from morph_dslam.mechanics.materials.library import constant_quantities
 
@@ -210,7 +210,7 @@ def _draw(path: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]
     """Measured points and computed curves, a panel for each kind of test; kinds that were not made show the spread."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     best = recommended(fitted, tests)
-    most = max(float(test.first_invariant.max()) for test in tests)
+    most = largest_invariant(tests)
     for place, kind in enumerate(KINDS, start=1):
         axes = figure.add_subplot(1, len(KINDS), place)
         made = [test for test in tests if test.kind == kind]

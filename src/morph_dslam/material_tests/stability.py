@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ngsolve as ngs
 import numpy as np
-from ngsolve.meshes import Make1DMesh
 from numpy.typing import NDArray
 from scipy.optimize import root_scalar
 
-from morph_dslam.material_tests.nominal_stress import KINDS
+from morph_dslam.material_tests.nominal_stress import KINDS, fields_in_cells
 from morph_dslam.mechanics.materials.base import Material
 
 Array = NDArray[np.float64]
@@ -56,15 +55,9 @@ def stretches_up_to(kind: str, most: float) -> Array:
 
 def _hessians(material: Material, strains: Array) -> Array:
     """(n, 2, 2) of the energy, Pa, at logarithmic principal stretches (n, 2)."""
-    n = len(strains)
-    mesh = Make1DMesh(n)
-    fields = []
-    for values in strains.T:
-        field = ngs.GridFunction(ngs.L2(mesh, order=0))
-        field.vec.FV().NumPy()[:] = values
-        fields.append(field)
+    fields, points = fields_in_cells(strains)
     logs = ngs.CF(tuple(fields)).MakeVariable()
     first, second = ngs.exp(logs[0]), ngs.exp(logs[1])
     F = ngs.CF((first, 0, 0, 0, second, 0, 0, 0, 1.0 / (first * second)), dims=(3, 3))
     hessian = material.parts(F)[0].Diff(logs).Diff(logs).Compile()
-    return np.asarray(hessian(mesh((np.arange(n) + 0.5) / n))).reshape(n, 2, 2)
+    return np.asarray(hessian(points)).reshape(-1, 2, 2)
