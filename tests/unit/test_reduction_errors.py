@@ -12,6 +12,8 @@ from tests.support.stretched_block import SIZE, stretched_block_model
 #: Held-out states, SI, and the parameters' changes that are the model's error there.
 STATES = np.array([[0.05, 0.002], [-0.05, 0.004]])
 CHANGES = np.array([[2e-3, 1e-4], [1e-3, -2e-4]])
+#: As far from one as from the other.
+MIDDLE = STATES.mean(axis=0)
 NEITHER = np.zeros(2, dtype=bool)
 
 
@@ -45,14 +47,22 @@ def test_errors_that_parameters_explain_are_theirs_and_rigid_motions_are_the_pos
     turned = np.cross([0.0, 2e-3, 0.0], model.nodes) + np.array([1e-4, -2e-4, 3e-4])
     errors = errors_of(certified(model, [displacement(model, change) + turned for change in CHANGES]))
     expected = CHANGES.T @ CHANGES / len(CHANGES)
-    for state in ([0.02, 0.001], [-0.04, 0.005]):  # the derivatives of this block are the same everywhere
-        assert errors.covariance(np.array(state), NEITHER) == pytest.approx(expected, rel=1e-5, abs=1e-14)
+    assert errors.covariance(MIDDLE, NEITHER) == pytest.approx(expected, rel=1e-5, abs=1e-14)
+
+
+def test_at_a_held_out_state_its_error_counts_most(model):
+    """Three quarters of the weight are its own here; errors of equal size weigh alike everywhere."""
+    errors = errors_of(certified(model, [displacement(model, change) for change in CHANGES]))
+    first, second = (np.outer(change, change) for change in CHANGES)
+    for state, expected in zip(STATES, (0.75 * first + 0.25 * second, 0.25 * first + 0.75 * second), strict=True):
+        assert errors.size_at(state) == pytest.approx(1e-9)
+        assert errors.covariance(state, NEITHER) == pytest.approx(expected, rel=1e-4, abs=1e-12)
 
 
 def test_what_a_constant_is_off_by_the_other_parameter_makes_good(model):
     """The slide is found from many states; the stretch makes up for its error as least squares say."""
     errors = errors_of(certified(model, [displacement(model, change) for change in CHANGES]))
-    found = errors.covariance(np.array([0.02, 0.001]), np.array([False, True]))
+    found = errors.covariance(MIDDLE, np.array([False, True]))
     variance = np.mean(CHANGES[:, 1] ** 2)
     assert found[1, 1] == pytest.approx(variance, rel=1e-5)
     nodes = np.unique(model.triangles)

@@ -68,7 +68,7 @@ class ModelErrors:
         if self.reduction is not None:
             own = len(mu) - self.n_loads
             covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own])
-            squared += self.reduction.size**2
+            squared += self.reduction.size_at(mu[:own]) ** 2
         return ModelDeviation(covariance, float(np.sqrt(squared)))
 
     def in_common(self, mu: Array) -> tuple[Array, float]:

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 HELD_OUT, ON_MODES = "held_out", "error_on_modes_m2"
 #: Variance of a parameter that is somewhere in its range, over the range squared: that of a uniform distribution.
 UNKNOWN = 1.0 / 12.0
+#: Distance below which a state is a held-out one, over the ranges.
+SAME_STATE = 1e-3
 
 
 def errors_on_modes(model: ReducedModel, errors: Iterable[Array]) -> list[list[float]]:
@@ -49,7 +51,7 @@ class ReductionErrors:
     ----------
     states : (k, d) held-out, SI.
     on_modes : (k, m) as of `errors_on_modes`.
-    size : of the displacement's error, root mean square, metres.
+    sizes : (k,) of the displacement's errors, metres.
     ranges : (d,) of the parameters.
     functions : of the displacement.
     products : (m, m) mean products of its modes on the surface, without rigid motions, squared metres.
@@ -57,7 +59,7 @@ class ReductionErrors:
 
     states: Array
     on_modes: Array
-    size: float
+    sizes: Array
     ranges: Array
     functions: Functions
     products: Array
@@ -72,16 +74,16 @@ class ReductionErrors:
         if not len(states) or not len(model.parameters) or (on_modes.shape, states.shape) != wanted:
             return None
         modes = _deforming_modes(model)
-        size = 1e-3 * float(np.sqrt(np.mean(np.square(stated["mean_mm"]))))
+        sizes = 1e-3 * np.array(stated["mean_mm"], dtype=np.float64)
         products = modes @ modes.T / (modes.shape[1] // 3)
-        return cls(states, on_modes, size, model.upper - model.lower, model.displacement.functions, products)
+        return cls(states, on_modes, sizes, model.upper - model.lower, model.displacement.functions, products)
 
     def covariance(self, mu: Array, constant: NDArray[np.bool_]) -> Array:
         """Covariance (d, d) of the parameters at a state, SI.
 
         With D the effects, e the error and r its size, the parameters are off by (D'D + r^2)^-1 D'e. What that leaves
         out is how far they are from where they are taken without evidence, r^2 (D'D + r^2)^-1 of it: one that moves the
-        surface by less than the error is anywhere in its range.
+        surface by less than the error is anywhere in its range. Errors of nearby held-out states count more.
 
         Parameters
         ----------
@@ -91,30 +93,42 @@ class ReductionErrors:
         """
         effects = self._effects(mu)
         free = np.flatnonzero(~constant)
-        inverse = self._inverse(effects[free])
+        least = self._least(mu)
+        inverse = self._inverse(effects[free], least)
         found = np.zeros((len(mu), len(mu)))
         errors = inverse @ effects[free] @ self.on_modes.T
-        unknown = self.least * inverse
-        found[np.ix_(free, free)] = errors @ errors.T / errors.shape[1] + UNKNOWN * unknown @ unknown.T
+        unknown = least * inverse
+        found[np.ix_(free, free)] = errors * self._weights(mu) @ errors.T + UNKNOWN * unknown @ unknown.T
         # What a constant is off by, the others make good as far as they can.
         taken = np.eye(len(mu))[:, constant]
         taken[free] = -inverse @ effects[free] @ self.products @ effects[constant].T
         found += taken * self._of_constants[constant] @ taken.T
         return np.asarray(found * np.outer(self.ranges, self.ranges))
 
+    def size_at(self, mu: Array) -> float:
+        """Root mean square error of the displacement near a state (d,), metres."""
+        return float(np.sqrt(self._weights(mu) @ self.sizes**2))
+
+    def _weights(self, mu: Array) -> Array:
+        """How much each held-out state (k,) counts at a state: half of it by its nearness, half as all others.
+
+        A model is often poor in one corner of its box only; but one good state does not make its surroundings good.
+        """
+        nearness = 1.0 / np.maximum(np.sum(((self.states - mu) / self.ranges) ** 2, axis=1), SAME_STATE**2)
+        return np.asarray(0.5 * (nearness / nearness.sum() + 1.0 / len(nearness)))
+
     def _effects(self, mu: Array) -> Array:
         """Derivatives (d, m) of the displacement's functions by the parameters, over their whole ranges."""
         return self.functions.rows(self.functions.nearest_inside(mu))[1:] * self.ranges[:, None]
 
-    def _inverse(self, effects: Array) -> Array:
+    def _inverse(self, effects: Array, least: float) -> Array:
         """Of the parameters' normal matrix (d, d); one that moves the surface by less than the error is unknown."""
         normal = effects @ self.products @ effects.T
-        return np.asarray(np.linalg.inv(normal + self.least * np.eye(len(normal))), dtype=np.float64)
+        return np.asarray(np.linalg.inv(normal + least * np.eye(len(normal))), dtype=np.float64)
 
-    @property
-    def least(self) -> float:
+    def _least(self, mu: Array) -> float:
         """Squared movement of the surface, square metres, below which the error hides a parameter."""
-        return max(self.size**2, float(np.finfo(float).tiny))
+        return max(self.size_at(mu) ** 2, float(np.finfo(float).tiny))
 
     @cached_property
     def _of_constants(self) -> Array:
@@ -122,7 +136,7 @@ class ReductionErrors:
         totals, weights = np.zeros(len(self.ranges)), np.zeros(len(self.ranges))
         for mu, on_modes in zip(self.states, self.on_modes, strict=True):
             effects = self._effects(mu)
-            inverse = self._inverse(effects)
+            inverse = self._inverse(effects, self._least(mu))
             shown = 1.0 / np.diag(inverse)
             totals, weights = totals + shown * (inverse @ effects @ on_modes) ** 2, weights + shown
         return np.asarray(totals / weights, dtype=np.float64)
