@@ -40,6 +40,7 @@ from morph_dslam.registration.messages import (
     WrongUnit,
 )
 from morph_dslam.registration.outline_snap import EXCLUDED, LEAST_CHANCE, OutlineSnap, distinct_states
+from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
@@ -149,6 +150,8 @@ def register_landmarks(
         moved = _not_at_rest(model, camera, bound, pixels, best, click_px)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
     covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
+    variance, normals = max(click_px, best.sigma_px) ** 2, np.zeros_like(pixels)
+    measured = MeasuredPoints(estimator, bound, pixels, np.ones(len(bound)), normals, variance)
     notes: tuple[RegistrationWarning, ...] = ()
     precise = Estimator(model, camera)
     precise.box = estimator.box
@@ -157,15 +160,20 @@ def register_landmarks(
         # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
         sigma = max(best.sigma_px, LEAST_PX) if np.isfinite(best.sigma_px) else UNKNOWN_PX
         best = refine_by_depth(precise, bound, pixels, best.state, sigma, depth, depth_sigma)
-        facts["along_the_sight_line"], covariance = "by depth", best.covariance
+        facts["along_the_sight_line"], covariance, measured = "by depth", best.covariance, None
         if at_rest:
             covariance = _without_parameters(covariance)
     elif image is not None:
         sigma = max(best.sigma_px, click_px) if np.isfinite(best.sigma_px) else UNKNOWN_PX
         snap = OutlineSnap(precise, bound, pixels, sigma, undistorted_grey(camera, image))
-        best, alternatives, notes = snap.corrected(best, alternatives)
-        facts["corrected_by_outline"] = not notes
-        covariance = covariance if notes else best.covariance
+        snapped, alternatives, notes = snap.corrected(best, alternatives)
+        facts["corrected_by_outline"] = snapped is not None
+        if snapped is not None:
+            best, covariance, measured = snapped.estimate, snapped.estimate.covariance, snapped.measured
+    if measured is not None:
+        linear, covariance = covariance, measured.spread_of_plausible(best.state, covariance)
+        aids = "depth images" if image is not None else "depth images, the outline (--snap)"
+        notes = (*notes, *measured.notes(best.state, linear, covariance, aids))
     alone_px = facts["sigma_px"] if depth is not None else np.nan
     warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px, moved, alone_px)
     warnings = (*warnings, *notes, *turned_away(model, best.state, landmarks.points))

@@ -161,6 +161,25 @@ class FewLandmarks(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class ShapeAgainstPose(RegistrationWarning):
+    """Shape and pose make good each other's changes in the frame, farther than the cost's curvature says.
+
+    Attributes
+    ----------
+    parameters : those that are told badly, with their standard deviations and units.
+    other_aids : that also tell the pose, and were not used.
+    """
+
+    template: ClassVar[str] = (
+        "shapes in a wide range, each with a pose of its own, fit this frame: {parameters}. What else tells the pose "
+        "narrows that: --still where camera and supports stand still, {other_aids}, or a start with the object at rest "
+        "(--at-rest)"
+    )
+    parameters: str
+    other_aids: str
+
+
+@dataclass(frozen=True)
 class LandmarksTurnedAway(RegistrationWarning):
     """The camera would see the landmarks through the object.
 

@@ -18,6 +18,7 @@ from scipy.special import fdtrc
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.messages import OutlineContradicts, OutlineInexact, OutlineUnseen, RegistrationWarning
+from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.outline import Outline, OutlineMeasurement
@@ -64,6 +65,7 @@ class Snap:
     Attributes
     ----------
     estimate : the state, its covariance counts points of the outline that err alike as one.
+    measured : landmarks, of weight 1, and outline.
     landmarks_squared : sum of the landmarks' squared residuals beside the outline, large ones by Huber's cost, px^2.
     outline_px : (p,) how far the outline is off each point where the state has it; infinite where it was not found.
     variance : of a point of the outline, px^2, and redundancy : how many points err as one.
@@ -73,6 +75,7 @@ class Snap:
     """
 
     estimate: Estimate
+    measured: MeasuredPoints
     landmarks_squared: float
     outline_px: Array
     variance: float
@@ -110,7 +113,7 @@ class OutlineSnap:
 
     def corrected(
         self, best: Estimate, alternatives: Sequence[State]
-    ) -> tuple[Estimate, tuple[State, ...], tuple[RegistrationWarning, ...]]:
+    ) -> tuple[Snap | None, tuple[State, ...], tuple[RegistrationWarning, ...]]:
         """A registration by landmarks as the outline corrects it.
 
         Parameters
@@ -120,7 +123,7 @@ class OutlineSnap:
 
         Returns
         -------
-        best : corrected, or as it was where the outline is not believed.
+        found : the corrected one; None where the outline is not believed.
         alternatives : those that landmarks and outline together cannot exclude.
         warnings : why the outline is not believed; none where it is.
         """
@@ -128,20 +131,20 @@ class OutlineSnap:
         snaps = [self.snapped(*start) for start in starts + [(near, best.state) for near in self._beside(best)]]
         seen = [snap for snap in snaps if snap.seen >= LEAST_SEEN]
         if not seen:
-            return best, tuple(alternatives), (OutlineUnseen(max(snap.seen for snap in snaps)),)
+            return None, tuple(alternatives), (OutlineUnseen(max(snap.seen for snap in snaps)),)
         exact = [snap for snap in seen if snap.variance <= self._sigma**2]
         if not exact:
             least_px = float(np.sqrt(min(snap.variance for snap in seen)))
-            return best, tuple(alternatives), (OutlineInexact(least_px, self._sigma),)
+            return None, tuple(alternatives), (OutlineInexact(least_px, self._sigma),)
         allowed = [snap for snap in exact if snap.chance >= LEAST_CHANCE]
         if not allowed:
             alone_px, beside_px = exact[0].landmarks_px
-            return best, tuple(alternatives), (OutlineContradicts(beside_px, alone_px),)
+            return None, tuple(alternatives), (OutlineContradicts(beside_px, alone_px),)
         surest = min(allowed, key=lambda snap: snap.variance)
         rated = sorted(((snap.chi_squared(self._sigma, surest), snap) for snap in allowed), key=lambda each: each[0])
         (least, first), *others = rated
         left = [snap.estimate.state for chi_squared, snap in others if chi_squared < least + EXCLUDED]
-        return first.estimate, distinct_states(self._estimator.model, first.estimate.state, left), ()
+        return first, distinct_states(self._estimator.model, first.estimate.state, left), ()
 
     def _beside(self, best: Estimate) -> list[State]:
         """States that landmarks hardly tell from the one that they have."""
@@ -159,7 +162,8 @@ class OutlineSnap:
         state, sigma, variance, redundancy, k = start, self._sigma, 1.0, 1.0, len(self._pixels)
         for reach in REACHES:
             seen = self._agreeing(outline.measure(self._grey, state, reach), state)
-            estimate = self._estimator.estimate(*self._measured(seen, sigma, redundancy * variance, state))
+            now = self._measured(seen, sigma, redundancy * variance)
+            estimate = self._estimator.estimate(now.points, now.pixels, now.weights, state, now.normals)
             balance, state = OutlineBalance(), estimate.state
             balance.learn_outline(seen, estimate.residuals[k:], self._n_unknowns)
             if np.isfinite(balance.outline.variance):
@@ -181,20 +185,19 @@ class OutlineSnap:
         _, _, _, away = self._estimator.evaluate(seen.points, seen.pixels, place, state, seen.normals)
         return seen.weighted(1.0, OutlineBalance().agreeing_alone(seen, np.nan_to_num(away, nan=np.inf), near=False))
 
-    def _measured(
-        self, seen: OutlineMeasurement, sigma: float, variance: float, state: State
-    ) -> tuple[BoundPoints, Array, Array, State, Array]:
-        """Landmarks and outline beside a state, as an estimate takes them; a landmark has the weight 1.
+    def _measured(self, seen: OutlineMeasurement, sigma: float, variance: float) -> MeasuredPoints:
+        """Landmarks and outline; a landmark has the weight 1.
 
         ``sigma`` is the deviation of a landmark's pixel, ``variance`` that of independent points of the outline.
         """
         k = len(self._pixels)
-        return (
+        return MeasuredPoints(
+            self._estimator,
             self._landmarks.joined(seen.points),
             np.concatenate([self._pixels, seen.pixels]),
             np.concatenate([np.ones(k), sigma**2 / variance * seen.weights]),
-            state,
             np.concatenate([np.zeros((k, 2)), seen.normals]),
+            sigma**2,
         )
 
     def _judged(
@@ -207,7 +210,9 @@ class OutlineSnap:
         redundancy: float,
     ) -> Snap:
         k, n, ones = len(self._pixels), self._n_unknowns, np.ones(len(self._pixels))
-        hessian = self._estimator.evaluate(*self._measured(seen, sigma, redundancy * variance, estimate.state))[1]
+        measured = self._measured(seen, sigma, redundancy * variance)
+        all_of_it = measured.points, measured.pixels, measured.weights, estimate.state, measured.normals
+        hessian = self._estimator.evaluate(*all_of_it)[1]
         alone, beside = (
             self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0]
             for state in (by_landmarks, estimate.state)
@@ -216,6 +221,7 @@ class OutlineSnap:
         away = np.linalg.norm(estimate.residuals[k:], axis=1)
         return Snap(
             replace(estimate, covariance=sigma**2 * self._inverse(hessian)),
+            measured,
             2.0 * beside,
             np.where(seen.valid, away, np.inf)[seen.expected],
             variance,
