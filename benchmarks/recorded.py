@@ -12,6 +12,10 @@ SOLVED = "finite element solutions that the reduction has not seen"
 NOISE = "grey values with 2 levels of noise, blur 0.5 to 0.6 px"
 #: How the rubber specimens were filmed.
 RUBBER = "a real camera with a long lens of unknown intrinsics; landmarks set by hand"
+EDGES = (
+    "a real camera with a long lens of unknown intrinsics; landmarks at the ends of edges, which are where the grey is "
+    "half way between both sides"
+)
 ABOUT_FORCE = (
     "`factor` is the measured force over the model's, whose two constants were fitted to this specimen's curve and "
     "that of the other notched one."
@@ -55,7 +59,7 @@ BENCHMARKS = {
         "Real rubber with short notches, stretched by a third",
         "python examples/rubber_tension/run.py --specimen notch_3.6mm --data DIR",
         "measured: optical flow of 600 speckles up to frame 100; forces of a testing machine",
-        RUBBER,
+        EDGES,
         3,
         ABOUT_FORCE,
     ),
@@ -64,7 +68,7 @@ BENCHMARKS = {
         "Real rubber with long notches, stretched by a quarter",
         "python examples/rubber_tension/run.py --specimen notch_7.2mm --data DIR",
         "measured: optical flow of 600 speckles up to frame 80; forces of a testing machine",
-        RUBBER,
+        EDGES,
         3,
         ABOUT_FORCE,
     ),
@@ -73,7 +77,7 @@ BENCHMARKS = {
         "The rubber's law from one specimen, the force of another from its video",
         "python examples/rubber_tension/identify.py --data DIR",
         "measured: forces of a testing machine, at the stroke of a clamp that moves evenly",
-        RUBBER,
+        EDGES,
         lines=8,
         about="Both constants are identified from the force curve of the specimen with long notches up to 10 mm of "
         "stroke. Chosen with both curves in sight: that the law is Mooney and Rivlin's, and that the stroke counts "

@@ -6,8 +6,8 @@ Mooney and Rivlin's two constants are identified from the force curve of the spe
 of 10 mm, before its crack grows. With them a model of the specimen with short notches is built and tracked in its
 video. What is compared is its force on the clamp, by the stroke that the images show, with the measured one at the
 stroke that the clamp had: it rests for 2.9 frames and then moves evenly by 0.1673 mm a frame, known to 1 %. Landmarks
-set by hand leave the zero of the stroke open by a few tenths of a millimetre, so that it is counted from the pictures
-in which the clamp rests; how far the force is off without that is printed too.
+leave the zero of the stroke open, by a few tenths of a millimetre where they are clicked carelessly, so that it is
+counted from the pictures in which the clamp rests; how far the force is off without that is printed too.
 """
 
 from __future__ import annotations

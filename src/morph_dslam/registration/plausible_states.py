@@ -20,7 +20,7 @@ from morph_dslam.tracking.state import pose_increment
 
 Array = NDArray[np.float64]
 #: Values of a parameter: spread evenly over its range, and around its estimate, in standard deviations.
-OVER_RANGE, AROUND = 24, (0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
+OVER_RANGE, AROUND = 24, (0.3, 0.6, 0.9, 1.2, 1.6, 2.0, 2.4, 2.8, 3.3, 3.8, 4.4)
 #: Rise of twice the cost, in variances of a coordinate, that ends the plausible states on a side: a minimum beyond is
 #: another one, of which `Ambiguous` tells.
 RIDGE = 16.0
@@ -60,7 +60,7 @@ class MeasuredPoints:
 
         Returns
         -------
-        (d + 6, d + 6), about ``best``, of no parameter smaller than before.
+        (d + 6, d + 6), about ``best``.
         """
         box = self.estimator.box
         if not (np.isfinite(self.variance) and np.isfinite(covariance).all()):
