@@ -20,6 +20,7 @@ from morph_dslam.errors import ExploreError
 from morph_dslam.io.local_server import LocalHandler, LocalServer, local_server
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
+from morph_dslam.model.shown_field import shown_kind
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
@@ -57,7 +58,7 @@ class ModelSurface:
     """
 
     def __init__(self, model: ReducedModel) -> None:
-        self._model = model
+        self._model, self._stress = model, shown_kind(model, "stress")
         used, corners = np.unique(model.triangles, return_inverse=True)
         self.nodes, self.triangles = model.nodes[used], corners.reshape(-1, 3)
         one = np.ones((len(used), 1))
@@ -65,10 +66,10 @@ class ModelSurface:
         self._stresses = {place: field.restrict(used[:, None], one) for place, field in model.stresses.items()}
 
     def values(self, mu: Array, key: str) -> Array:
-        """The field ``key`` (n,) for parameters ``mu`` (d,) in the unit of its colours: mm or MPa."""
+        """The field ``key`` (n,) for parameters ``mu`` (d,) in the unit of its colours."""
         if key == "displacement":
             return 1e3 * np.linalg.norm(self._displacement.value(mu), axis=1)
-        return 1e-6 * von_mises(self._stresses[key].value(mu))
+        return von_mises(self._stresses[key].value(mu)) / self._stress.si_factor
 
     def state(self, mu: Array, key: str) -> bytes:
         """Little-endian floats: displacements (n, 3) in metres, then the values (n,) of field ``key``."""
@@ -89,7 +90,8 @@ class ModelSurface:
         result = []
         for key, label in names.items():
             top = float(np.percentile([self.values(mu, key) for mu in samples], _PERCENTILE))
-            result.append(_ColourField(key, label, "mm" if key == "displacement" else "MPa", _round_up(top or 1.0)))
+            unit = "mm" if key == "displacement" else self._stress.unit
+            result.append(_ColourField(key, label, unit, _round_up(top or 1.0)))
         return tuple(result)
 
     def description(self) -> dict[str, Any]:

@@ -22,5 +22,6 @@ from morph_dslam.model.inner_structure import (
     save_inner_structure as save_inner_structure,
 )
 from morph_dslam.model.reduced_model import spread_over as spread_over, von_mises as von_mises
+from morph_dslam.model.shown_field import ShownKind as ShownKind, shown_kind as shown_kind
 from morph_dslam.model.tensor_functions import CPFunctions as CPFunctions
 from morph_dslam.model.unknown_loads import with_unknown_loads as with_unknown_loads

@@ -23,7 +23,7 @@ from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
 from morph_dslam.io.state_choice import States
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
+from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 
 Array = NDArray[np.float64]
 Colours = Literal["stress", "strain", "displacement", "none"]
@@ -182,7 +182,7 @@ def _coloured(buffer: _Buffer, states: States, show: Shown) -> dict[str, Any]:
         scale = {} if i == 0 else {"scale": [0.0, 0.0, 0.0]}
         nodes.append({"name": f"state {i}", "mesh": i, "translation": middle.tolist(), **scale})
         nodes[0]["children"].append(i + 1)
-    colours = {"field": SHOWN[show].name, "unit": SHOWN[show].unit, "range": [0.0, top], "colour_map": COLOUR_MAP}
+    colours = {"field": field.kind.name, "unit": field.kind.unit, "range": [0.0, top], "colour_map": COLOUR_MAP}
     nodes[0]["extras"] = {"colours": colours}
     content: dict[str, Any] = {"nodes": nodes, "meshes": meshes, "materials": [_material([1.0] * 4)]}
     if len(states) > 1:

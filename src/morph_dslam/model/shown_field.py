@@ -40,12 +40,24 @@ class ShownKind:
     si_factor: float
 
 
+STRESS = "von Mises stress"
 SHOWN: dict[Shown, ShownKind] = {
-    "stress": ShownKind("von Mises stress", "MPa", "Pa", 1e6),
+    "stress": ShownKind(STRESS, "MPa", "Pa", 1e6),
     "strain": ShownKind("equivalent strain", "%", "1", 1e-2),
     "displacement": ShownKind("displacement", "mm", "m", 1e-3),
     "traction": ShownKind("traction of unknown loads", "kPa", "Pa", 1e3),
 }
+#: Stress of soft bodies, from the smallest largest one, MPa, upwards.
+_SMALL_STRESSES = {1e-4: ShownKind(STRESS, "Pa", "Pa", 1.0), 0.1: ShownKind(STRESS, "kPa", "Pa", 1e3)}
+
+
+def shown_kind(model: ReducedModel, show: Shown) -> ShownKind:
+    """How a field of a model is called: stress that stays small, by the model's certificate, in kPa or Pa."""
+    stated = [model.certificate.get(f"stress_{place}", {}).get("von_mises", {}) for place in model.stresses]
+    largest = max((entry.get("largest_MPa") or 0.0 for entry in stated), default=0.0)
+    if show == "stress" and largest > 0.0:
+        return next((kind for below, kind in _SMALL_STRESSES.items() if largest < below), SHOWN[show])
+    return SHOWN[show]
 
 
 class ShownField:
@@ -58,10 +70,15 @@ class ShownField:
     model : that holds the field.
     points : where.
     show : the field.
+
+    Attributes
+    ----------
+    kind : how it is called, and its unit.
     """
 
     def __init__(self, model: ReducedModel, points: MaterialPoints, show: Shown) -> None:
         self._model, self._points, self._show = model, points, show
+        self.kind = shown_kind(model, show)
         self._displacement = self._restricted("displacement")
         self._fields = {name: self._restricted(name) for name in _fields_of(model, show)}
         self._last: dict[str, tuple[Array, Array]] = {}
@@ -79,7 +96,7 @@ class ShownField:
         return self._kept("displacement", parameters, self._displacement.value)
 
     def values(self, parameters: Array, displacement: Array, side: Literal["top", "bottom"] | None = None) -> Array:
-        """The field (n,) in the unit of its `ShownKind`; NaN for a rigid object.
+        """The field (n,) in the unit of `kind`; NaN for a rigid object.
 
         Parameters
         ----------
@@ -90,7 +107,7 @@ class ShownField:
         if not self._model.parameters:
             return np.full(len(displacement), np.nan)
         if self._show == "displacement":
-            return 1e3 * np.linalg.norm(displacement, axis=1)
+            return np.linalg.norm(displacement, axis=1) / self.kind.si_factor
         names = list(self._fields) if side is None else [f"stress_{side}"]
         return np.max([self._kept(name, parameters, partial(self._size, name)) for name in names], axis=0)
 
@@ -98,10 +115,10 @@ class ShownField:
         """What is shown (n,) of a field."""
         field = self._fields[name].value(parameters)
         if self._show == "strain":
-            return 100.0 * equivalent_strain(field)
-        if self._show == "traction":
-            return 1e-3 * np.linalg.norm(field, axis=1)
-        return 1e-6 * von_mises(field)
+            size = equivalent_strain(field)
+        else:
+            size = np.linalg.norm(field, axis=1) if self._show == "traction" else von_mises(field)
+        return size / self.kind.si_factor
 
     def _kept(self, name: str, parameters: Array, evaluate: Callable[[Array], Array]) -> Array:
         """What was evaluated for the same parameters last, whichever thread did it, or now."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.shown_field import shown_kind
 from morph_dslam.render.overlay import colour_levels, draw_overlay, paint_surface
 from morph_dslam.render.shading import colour_table, lambert, vertex_normals
 
@@ -123,7 +124,8 @@ def draw_states(
     (h, w, 3) uint8, blue, green, red.
     """
     shapes = [model.positions(mu) for mu in states]
-    stresses = [1e-6 * model.von_mises(mu, "solid") for mu in states]
+    kind = shown_kind(model, "stress")
+    stresses = [model.von_mises(mu, "solid") / kind.si_factor for mu in states]
     seen = np.unique(model.triangles)
     top = max(float(np.percentile(np.concatenate([stress[seen] for stress in stresses]), 99.5)), 1e-9)
     # The colour bar takes the right.
@@ -140,7 +142,7 @@ def draw_states(
                 model.triangles,
                 stress,
                 (0.0, top),
-                label="von Mises stress [MPa]",
+                label=f"{kind.name} [{kind.unit}]",
                 alpha=1.0,
                 brightness=brightness,
                 caption=caption,

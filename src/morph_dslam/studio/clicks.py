@@ -18,6 +18,7 @@ from morph_dslam import Camera, ReducedModel, Registration, load_camera, load_mo
 from morph_dslam.errors import CameraError, RegistrationError, StudioError
 from morph_dslam.explorer.server import BadRequest, ModelPages
 from morph_dslam.extend.geometry import RigidTransform
+from morph_dslam.extend.models import shown_kind
 from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
 from morph_dslam.extend.tracking import State
 from morph_dslam.io.packing import packed
@@ -86,8 +87,12 @@ def camera_problem(path: Path, width: int, height: int) -> str | None:
 
 
 def model_facts(path: Path) -> dict[str, Any]:
-    """Name, sizes, errors and parameters of a model; ``factor`` turns SI into a parameter's own unit."""
+    """Name, sizes, errors and parameters of a model; ``factor`` turns SI into a parameter's own unit.
+
+    That of ``stress`` turns the unit in which people read it into SI.
+    """
     model = opened_model(path)
+    stress = shown_kind(model, "stress")
     parameters = [
         {
             "name": p.name,
@@ -104,7 +109,7 @@ def model_facts(path: Path) -> dict[str, Any]:
         "name": model.name,
         "nodes": len(model.nodes),
         "parameters": parameters,
-        "has_stress": bool(model.stresses),
+        "stress": {"unit": stress.unit, "factor": stress.si_factor} if model.stresses else None,
         "supports": sorted(model.supports),
     }
 
@@ -208,7 +213,7 @@ def overlay(model_path: Path, camera_path: Path, parameters: Sequence[float], po
     Returns
     -------
     ``pixels`` (n, 2) of the surface's nodes, ``order`` (t,) of its triangles that face the camera, from the farthest to
-    the nearest, ``values`` (n,) von Mises stress in MPa or displacement in mm, ``displacement`` (n, 3) in metres.
+    the nearest, ``values`` (n,) von Mises stress or displacement in ``unit``, ``displacement`` (n, 3) in metres.
     """
     transform = RigidTransform.from_matrix(np.array(pose, dtype=np.float64))
     return _overlay(model_path, opened_camera(camera_path), np.array(parameters), transform, {})
@@ -228,7 +233,8 @@ def _overlay(path: Path, camera: Camera, mu: Array, camera_from_object: RigidTra
         seen &= np.einsum("tx,tx->t", normals, centres) < 0.0
     order = np.flatnonzero(seen)[np.argsort(-centres[seen, 2])]
     if model.stresses:
-        values, unit = 1e-6 * model.von_mises(mu)[used], "MPa"
+        kind = shown_kind(model, "stress")
+        values, unit = model.von_mises(mu)[used] / kind.si_factor, kind.unit
     else:
         values, unit = 1e3 * np.linalg.norm(displacement, axis=1), "mm"
     return packed(
@@ -255,8 +261,9 @@ def explore_answer(path: Path, target: str) -> tuple[str, bytes] | None:
 
 def _top(path: Path) -> float:
     """The end of the colours, one for the whole box as in `morph explore`."""
-    fields = {field.unit: field.top for field in _pages(path, stamp(path)).surface.fields}
-    return fields.get("MPa", fields["mm"])
+    tops = {field.unit: field.top for field in _pages(path, stamp(path)).surface.fields}
+    in_mm = tops.pop("mm")
+    return next(iter(tops.values()), in_mm)
 
 
 def save_clicks(pairs: Sequence[Sequence[float]], target: Path) -> None:

@@ -21,7 +21,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.reduced_model import MaterialPoints
-from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
+from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 from morph_dslam.registration.mesh_edges import SPACING, MeshEdges
 from morph_dslam.render.overlay import BarPlace, draw_inner_surface, draw_overlay
 from morph_dslam.render.shading import lambert, text_patch, vertex_normals
@@ -233,7 +233,7 @@ class AugmentedView:
         """Name and unit of the field; empty for a rigid object, which is drawn grey."""
         if not self._model.parameters:
             return ""
-        kind = SHOWN[self.show]
+        kind = self._field.kind
         return f"{kind.name} [{kind.unit}]"
 
     def view(self, state: State) -> View:

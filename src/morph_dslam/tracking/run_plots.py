@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
+from morph_dslam.model.shown_field import shown_kind
 from morph_dslam.tracking.reactions import VectorEstimate
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.run_results import RunResults
@@ -69,7 +70,8 @@ def plot_confidence(path: Path, run: RunResults) -> None:
     """The largest displacement and the largest stress, each with a band of two standard deviations."""
     rows = [("largest displacement [mm]", 1e3 * run.largest_displacements())]
     if run.model.stresses:
-        rows.append(("largest von Mises stress [MPa]", 1e-6 * run.largest_stresses()))
+        kind = shown_kind(run.model, "stress")
+        rows.append((f"largest {kind.name} [{kind.unit}]", run.largest_stresses() / kind.si_factor))
     figure, all_axes = _rows(len(rows), 2.2)
     for axes, (label, both) in zip(all_axes, rows, strict=True):
         # A frame that tells nothing must not hide what the others tell.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import StreamError
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.model.shown_field import SHOWN, Shown, ShownField, shown_field, surface_points
+from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 from morph_dslam.streams.destinations import open_destination
 from morph_dslam.streams.messages import (
     FrameMessage,
@@ -150,7 +150,7 @@ class _ObjectMessages:
         kind = shown_field(model, streamed.show)
         self._rest, self._modulus_std = model.rest_positions(points), streamed.modulus_std
         self._field, self._reactions = streamed.field or ShownField(model, points, kind), Reactions(model)
-        self._covers_jumps, self._si_factor = kind == "displacement", SHOWN[kind].si_factor
+        self._covers_jumps, self._si_factor = kind == "displacement", self._field.kind.si_factor
         self.info = ObjectInfo(
             name,
             model.name,
@@ -158,7 +158,7 @@ class _ObjectMessages:
             triangles,
             points.corners[:, 0],
             tuple(map(_parameter_info, model.study_parameters)),
-            _scalar_info(kind, self._field) if model.parameters else None,
+            _scalar_info(self._field) if model.parameters else None,
             tuple(self._reactions.names),
         )
 
@@ -214,9 +214,9 @@ def _parameter_info(parameter: Parameter) -> ParameterInfo:
     )
 
 
-def _scalar_info(kind: Shown, field: ShownField) -> ScalarInfo:
+def _scalar_info(field: ShownField) -> ScalarInfo:
     low, high = field.range_of_box()
-    shown = SHOWN[kind]
+    shown = field.kind
     return ScalarInfo(
         shown.name, shown.si_unit, shown.unit, shown.si_factor, low * shown.si_factor, high * shown.si_factor
     )

@@ -53,7 +53,7 @@ class Page {
   addControls() {
     const fields = this.model.fields.map((field) => new Option(field.label, field.key));
     element('field').append(...fields);
-    const stressed = this.model.fields.findIndex((field) => field.unit === 'MPa');
+    const stressed = this.model.fields.findIndex((field) => field.unit !== 'mm');
     if (stressed >= 0) fields[stressed].defaultSelected = fields[stressed].selected = true;
     element('field').addEventListener('change', () => this.update());
     element('fit').addEventListener('change', () => this.draw());

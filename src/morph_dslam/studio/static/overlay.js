@@ -150,7 +150,7 @@ export function colourBar(colours, overlay) {
   const stops = [0, 51, 102, 153, 204, 255].map((i) => `rgb(${colours[i].slice(0, 3).join(' ')})`);
   const gradient = document.createElement('i');
   gradient.style.background = `linear-gradient(90deg, ${stops.join(', ')})`;
-  const words = overlay.unit === 'MPa' ? 'von Mises stress' : 'displacement';
+  const words = overlay.unit === 'mm' ? 'displacement' : 'von Mises stress';
   bar.append(`${words}  0`, gradient, `${overlay.top} ${overlay.unit}`);
   return bar;
 }

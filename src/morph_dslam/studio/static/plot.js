@@ -105,7 +105,7 @@ function steps(low, high) {
 // Lines of a run's frames: parameters in their own units, forces, the largest stress or displacement.
 export function makePlots(container, model) {
   const parameters = model.parameters.slice(0, 3).map((p) => ({ p, plot: new Plot(container, p.name, p.unit) }));
-  const largest = model.has_stress ? new Plot(container, 'largest von Mises stress', 'MPa')
+  const largest = model.stress ? new Plot(container, 'largest von Mises stress', model.stress.unit)
     : new Plot(container, 'largest displacement', 'mm');
   const forces = model.supports.length ? new Plot(container, 'reactions', 'N') : null;
   return (frames, current = null) => {
@@ -114,7 +114,7 @@ export function makePlots(container, model) {
     for (const { p, plot } of parameters) {
       plot.set([line(p.name, (row) => scaled(row.parameters[p.name], p.factor))], current);
     }
-    largest.set([line('', (row) => (model.has_stress ? scaled(row.largest_von_mises, 1e-6)
+    largest.set([line('', (row) => (model.stress ? scaled(row.largest_von_mises, 1 / model.stress.factor)
       : scaled(row.largest_displacement, 1e3)))], current);
     forces?.set(model.supports.map((name) => line(name, (row) => {
       const force = row.forces[name];

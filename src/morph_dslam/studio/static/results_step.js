@@ -51,7 +51,7 @@ export async function resultsStep(app) {
     const scaled = model.parameters.map((p) => [p.name, `${digits(row.parameters[p.name] === null ? null : row.parameters[p.name] * p.factor)} ${p.unit}`]);
     const parts = [['Frame', String(row.frame)], ['Status', row.status], ...scaled];
     if (row.largest_displacement !== null) parts.push(['Largest displacement', `${digits(1e3 * row.largest_displacement)} mm`]);
-    if (row.largest_von_mises !== null) parts.push(['Largest stress', `${digits(1e-6 * row.largest_von_mises)} MPa`]);
+    if (row.largest_von_mises !== null) parts.push(['Largest stress', `${digits(row.largest_von_mises / model.stress.factor)} ${model.stress.unit}`]);
     for (const [name, force] of Object.entries(row.forces)) {
       if (force) parts.push([`Force on ${name}`, `${digits(Math.hypot(...force))} N`]);
     }
