@@ -158,6 +158,30 @@ def test_pairs_clicked_on_a_recording_that_another_page_has_replaced_are_not_sav
     assert client.state()["done"]["start"]
 
 
+def started_command(client):
+    """What *Track* starts, which is stopped at once."""
+    client.call("track")
+    client.call("stop")
+    return ended_job(client)["command"].split()
+
+
+def test_landmarks_are_those_of_an_undeformed_object_only_where_somebody_says_so(tracked, videos):
+    """Said of pairs that were saved; neither of other ones that are uploaded, nor of those of another recording."""
+    client, folder = tracked
+    clicked = {"pairs": pairs_of(bent_sheet_model(), STATES[0]), "frame": 0}
+    client.call("save_start", **clicked, at_rest=True)
+    assert "--at-rest" in started_command(client)
+    landmarks = (folder / "landmarks.csv").read_bytes()
+    assert client.upload("landmarks", "landmarks.csv", landmarks) == 200
+    assert not client.call("start_files")["at_rest"]
+    assert "--at-rest" not in started_command(client)
+    client.call("save_start", **clicked, at_rest=True)
+    assert client.upload("recording", "b.mp4", videos[1]) == 200
+    assert not client.call("start_files")["at_rest"]
+    assert client.upload("landmarks", "landmarks.csv", landmarks) == 200
+    assert "--at-rest" not in started_command(client)
+
+
 def test_every_page_is_told_of_another_recording(tracked, videos):
     client, _ = tracked
     uploaded = []

@@ -204,8 +204,10 @@ def test_frames_of_an_earlier_run_stay_until_another_one_has_begun(studio, film)
         assert job["status"] == 2, job["lines"]
         assert kept() == ["000000.png", *earlier]
         assert client.state()["recording"]["frames"] == 6
-        client.call("save_start", pairs=clicked_pairs(model, states[0]), frame=0, at_rest=False)
+        client.call("save_start", pairs=clicked_pairs(model, states[0]), frame=0, at_rest=True)
+        assert client.upload("landmarks", "landmarks.csv", (folder / "landmarks.csv").read_bytes()) == 200
         client.call("go_live")
+        assert "--at-rest" not in client.state()["job"]["command"]  # nobody said so of what was uploaded
         wait_for_job(client, lambda job: job["what"].startswith("tracking") or not job["running"])
         for number in (1, 2):
             phone.send(number, jpegs[number])

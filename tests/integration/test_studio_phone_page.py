@@ -55,7 +55,6 @@ def take_and_click(computer, project, model):
     state = STATES[number_in(cv2.imread(str(project / "live" / "000000.jpg")))]
     nodes = [int(np.linalg.norm(model.nodes - 1e-3 * np.array(point), axis=1).argmin()) for point in POINTS]
     seen = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
-    computer.click("#at-rest")
     for count, (point, pixel) in enumerate(zip(model.nodes[nodes].tolist(), seen.tolist(), strict=True), start=1):
         x, y = computer.evaluate(f"document.querySelector('#start-mesh').view.onPage({point})")
         computer.click_at(x, y)

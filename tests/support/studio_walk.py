@@ -126,6 +126,7 @@ def click_start(page, folder, shots):
     """Click each point on the mesh, and its pixel by the truth, as near as the screen's pixels allow."""
     page.click("#to-start")
     page.wait_for("document.querySelector('#panel').dataset.ready === 'start'")
+    page.click("#at-rest")
     camera, truth = load_camera(folder / "film" / "camera.yaml"), np.load(folder / "film" / "truth.npz")
     pose = truth["camera_from_object"][0]
     for count, point in enumerate(POINTS, start=1):

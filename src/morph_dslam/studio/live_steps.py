@@ -148,7 +148,7 @@ class LiveSteps:
     async def _pairs_words(self, snap: bool) -> list[str]:
         """The options of `morph live` that start from pairs, in their frame."""
         self._need(names.LANDMARKS, "take a frame, click pairs on it, and save them")
-        flags = {"--at-rest": self._project.choices.get("at_rest", True), "--snap": snap}
+        flags = {"--at-rest": self._project.choices.get("at_rest", False), "--snap": snap}
         words = ["--landmarks", names.LANDMARKS, *(flag for flag, is_set in flags.items() if is_set)]
         return [*words, "--reference-image", await self._write_reference()]
 

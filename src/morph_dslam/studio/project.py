@@ -229,7 +229,7 @@ class Project:
         if landmarks.is_file():
             landmarks.replace(self.path(EARLIER_LANDMARKS))
             self.choose(pairs_were_of=self.choices.get("recording", ""))
-        self.choose(reference_frame=None, recording_number=self.recording_number + 1)
+        self.choose(reference_frame=None, at_rest=None, recording_number=self.recording_number + 1)
 
     @property
     def recording_number(self) -> int:

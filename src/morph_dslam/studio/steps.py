@@ -168,7 +168,8 @@ class Steps:
             project.choose(camera_from=name, camera_note=None)
         elif kind == "landmarks":
             project.write(names.LANDMARKS, path.read_text()) if path.name != names.LANDMARKS else None
-            project.choose(pairs_were_of=None)
+            # Nobody has said of these landmarks that they show the object undeformed.
+            project.choose(pairs_were_of=None, at_rest=None)
         elif kind == "scan":
             self.scan.uploaded(name)
         elif kind == "object":
@@ -366,7 +367,7 @@ class Steps:
         """The pairs that were clicked before, and the frame they belong to."""
         pairs = await self._worker.call(clicks.read_clicks, self.project.path(names.LANDMARKS))
         chosen = self.project.choices
-        return {"pairs": pairs, "frame": chosen.get("reference_frame"), "at_rest": chosen.get("at_rest", True)}
+        return {"pairs": pairs, "frame": chosen.get("reference_frame"), "at_rest": chosen.get("at_rest", False)}
 
     async def model_mesh(self) -> bytes:
         """The undeformed surface of the model."""
@@ -416,7 +417,7 @@ class Steps:
         if chosen.get("reference_frame") is not None:
             words += ["--reference-frame", str(chosen["reference_frame"])]
         # A start that is known to be undeformed is not refined: what is refined counts for less than all frames tell.
-        at_rest = chosen.get("at_rest", True) and not refine
+        at_rest = chosen.get("at_rest", False) and not refine
         flags = {"--at-rest": at_rest, "--snap": snap, "--refine": refine}
         return words + [flag for flag, is_set in flags.items() if is_set]
 

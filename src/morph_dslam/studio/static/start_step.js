@@ -75,6 +75,7 @@ export async function startStep(app) {
   app.panel.append(
     el('div', { className: 'row' }, el('span', { className: 'fixed' }, 'Frame'), frameInput, frameText),
     check('The object is undeformed in this frame', atRest),
+    el('p', { className: 'note' }, 'Tick this only if no load deforms it there. Otherwise the pairs give its parameters too.'),
     list, result,
     el('div', { className: 'row' }, el('span', { className: 'fixed' }, 'Overlay'), opacity),
     el('div', { className: 'row' }, save, el('button', { id: 'clear', onclick: () => { pairs = []; fit(); } }, 'Clear')),

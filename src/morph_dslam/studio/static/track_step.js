@@ -45,7 +45,7 @@ export async function trackStep(app) {
     return {};
   }
   const [mesh, model, { colours }] = await Promise.all([call('model_mesh'), call('model'), explored('model.json')]);
-  const refine = el('input', { id: 'refine', checked: !(app.state.choices.at_rest ?? true) });
+  const refine = el('input', { id: 'refine', checked: !app.state.choices.at_rest });
   const snap = el('input', { id: 'snap' });
   const outline = el('input', { id: 'outline' });
   const start = el('button', { id: 'track', className: 'main', onclick: () => app.doing(() => call('track',
