@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import main
-from morph_dslam.errors import ModelFileError, StudyError
+from morph_dslam.errors import ModelFileError, StudyError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
@@ -16,7 +16,10 @@ from morph_dslam.render.overlay import draw_inner_surface, draw_overlay
 from morph_dslam.studies.inner_structures import place_inner_structure
 from morph_dslam.tracking.estimator import Estimate, State, moved
 from morph_dslam.tracking.run_folder import centre_and_std
+from morph_dslam.tracking.run_options import TrackOptions
+from morph_dslam.tracking.setup import load_objects
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA
 from tests.support.small_models import block_model
 
 #: Four points inside of the block of 100 mm.
@@ -136,18 +139,65 @@ def test_what_lies_behind_the_surface_is_drawn_through_it():
     assert (labelled[30:49, 78:100] != before[30:49, 78:100]).any()
 
 
+def write_surface(path, nodes):
+    """An .obj file of the four points, as numbers without a unit."""
+    lines = ["v {:.6f} {:.6f} {:.6f}".format(*node) for node in nodes]
+    lines += ["f {} {} {}".format(*triangle) for triangle in TRIANGLES + 1]
+    path.write_text("\n".join(lines) + "\n")
+
+
 def test_the_command_places_a_surface_file(tmp_path, capsys):
     save_model(tmp_path / "block.morph", affine_block())
-    lines = ["v {:.6f} {:.6f} {:.6f}".format(*node) for node in 1e3 * NODES]
-    lines += ["f {} {} {}".format(*triangle) for triangle in TRIANGLES + 1]
-    (tmp_path / "tumour.obj").write_text("\n".join(lines) + "\n")
+    write_surface(tmp_path / "tumour.obj", 1e3 * NODES)
     command = ["inner", str(tmp_path / "tumour.obj"), "--model", str(tmp_path / "block.morph")]
     assert main([*command, "--unit", "mm", "-o", str(tmp_path / "tumour.h5")]) == 0
-    assert "'tumour', 4 nodes inside of 'block'" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "'tumour', 4 nodes inside of 'block', 40 x 40 x 40 mm around (37.5, 45, 52.5) mm" in out
+    assert "note:" not in out
     found = load_inner_structure(tmp_path / "tumour.h5")
     np.testing.assert_allclose(np.sort(found.rest, axis=0), np.sort(NODES, axis=0), atol=1e-9)
     assert main([*command, "--unit", "cm", "-o", str(tmp_path / "wrong.h5")]) == 2
     assert "does not fit into 'block'" in capsys.readouterr().err
+
+
+def test_a_structure_that_is_hardly_as_small_is_named_with_the_unit_that_fits(tmp_path, capsys):
+    """Drawn in metres and read in millimetres; a bead of 0.5 mm may be one."""
+    save_model(tmp_path / "block.morph", affine_block())
+    command = ["inner", str(tmp_path / "tumour.obj"), "--model", str(tmp_path / "block.morph"), "--unit", "mm"]
+    write_surface(tmp_path / "tumour.obj", NODES)
+    assert main([*command, "-o", str(tmp_path / "tumour.h5")]) == 0
+    out = capsys.readouterr().out
+    assert "measures 0.04 x 0.04 x 0.04 mm in a solid of 100 x 100 x 100 mm" in out
+    assert "drawn in m, it would measure 40 x 40 x 40 mm and lie inside too: if so, make it again with --unit m" in out
+    for size, is_named in ((0.5, False), (0.05, True)):
+        write_surface(tmp_path / "tumour.obj", [60, 70, 80] + size * (NODES - NODES[0]) / 0.04)
+        assert main([*command, "-o", str(tmp_path / "tumour.h5")]) == 0
+        assert ("is --unit mm right?" in capsys.readouterr().out) == is_named
+
+
+def test_names_are_of_letters_digits_and_spaces(tmp_path, capsys):
+    save_model(tmp_path / "block.morph", affine_block())
+    write_surface(tmp_path / "tumour.obj", 1e3 * NODES)
+    command = ["inner", str(tmp_path / "tumour.obj"), "--model", str(tmp_path / "block.morph"), "--unit", "mm"]
+    assert main([*command, "--name", "left/lobe", "-o", str(tmp_path / "tumour.h5")]) == 2
+    assert "'left/lobe' is no name of an inner structure: give one of letters" in capsys.readouterr().err
+    assert not (tmp_path / "tumour.h5").exists()
+
+
+def test_two_structures_of_one_name_are_refused_before_the_tracking(tmp_path):
+    save_model(tmp_path / "block.morph", affine_block())
+    for name in ("a.h5", "b.h5"):
+        save_inner_structure(tmp_path / name, placed())
+    run = TrackOptions(
+        frames="frames",
+        model=tmp_path / "block.morph",
+        camera=tmp_path / "camera.yaml",
+        output=tmp_path / "run",
+        landmarks=tmp_path / "landmarks.csv",
+        inner=(tmp_path / "a.h5", tmp_path / "b.h5"),
+    )
+    with pytest.raises(TrackingError, match=r"two inner structures are called 'tumour', the second one is .*b\.h5"):
+        load_objects(run, CAMERA)
 
 
 def test_a_file_of_another_kind_is_named_with_those_that_are_read(tmp_path, capsys):

@@ -19,10 +19,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import load_model
     from morph_dslam.extend.models import save_inner_structure
-    from morph_dslam.extend.studies import read_inner_structure
+    from morph_dslam.extend.studies import described_inner, inner_size_note, read_inner_structure
 
     model = load_model(arguments.model)
     name = arguments.name or arguments.surface.stem
     structure = read_inner_structure(model, name, arguments.surface, arguments.unit)
     save_inner_structure(arguments.output, structure)
-    print(f"wrote {arguments.output}: '{name}', {len(structure.rest)} nodes inside of '{model.name}'")
+    place = described_inner(structure)
+    print(f"wrote {arguments.output}: '{name}', {len(structure.rest)} nodes inside of '{model.name}', {place}")
+    note = inner_size_note(model, structure, arguments.unit)
+    if note is not None:
+        print(f"note: {note}")

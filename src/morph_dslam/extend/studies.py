@@ -5,6 +5,8 @@ from morph_dslam.meshing.surface_repair import repairs_in_words as repairs_in_wo
 from morph_dslam.studies.build import build_warnings as build_warnings
 from morph_dslam.studies.executors import default_executor as default_executor
 from morph_dslam.studies.inner_structures import (
+    described_inner as described_inner,
+    inner_size_note as inner_size_note,
     place_inner_structure as place_inner_structure,
     read_inner_structure as read_inner_structure,
 )

@@ -12,6 +12,9 @@ from typing import Any
 from morph_dslam.errors import MorphError
 
 _BRACKETED = re.compile(r"(.*\S)\s*\[(.+)\]")
+#: A name that becomes a part of columns, and a group in a file.
+PLAIN_NAME = re.compile(r"\w[\w -]*")
+PLAIN_NAME_RULE = "give one of letters, digits, spaces, - and _"
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 

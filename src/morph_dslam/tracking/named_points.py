@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import ParameterError, TrackingError
+from morph_dslam.io.text import PLAIN_NAME, PLAIN_NAME_RULE
 from morph_dslam.model import MaterialPoints, ReducedModel
 from morph_dslam.registration.landmarks import SURFACE_SHARE
 from morph_dslam.tracking.binding import nearest_surface_points
 
 Array = NDArray[np.float64]
-#: A name becomes a part of columns, and a group in a file.
-_NAME = re.compile(r"\w[\w -]*")
 #: A name, and coordinates in metres.
 Place = tuple[str, tuple[float, float, float]]
 
@@ -66,8 +64,8 @@ class NamedPoints:
 
 def _check_names(names: Sequence[str]) -> None:
     for name in names:
-        if not _NAME.fullmatch(name):
-            raise TrackingError(f"'{name}' is no name of a point: give one of letters, digits, spaces, - and _")
+        if not PLAIN_NAME.fullmatch(name):
+            raise TrackingError(f"'{name}' is no name of a point: {PLAIN_NAME_RULE}")
         if names.count(name) > 1:
             raise TrackingError(f"two points are called '{name}': give each another name")
 
