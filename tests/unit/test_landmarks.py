@@ -242,6 +242,34 @@ def test_an_object_that_is_not_at_rest_is_named_with_what_the_landmarks_alone_gi
     assert said.sigma_px > 2.0 * said.free_px
 
 
+def test_an_object_that_is_not_at_rest_is_named_though_its_landmarks_fit_at_rest():
+    """An arch of 18 mm, seen from the front and 0.8 m away, is less than a pixel beside a pose of the flat sheet."""
+    away = RigidTransform(POSE.rotation, np.array([0.02, -0.01, 0.8]))
+    arched = landmarks(State(np.array([0.018, 0.0, 0.0]), away), count=20, noise=0.4)
+    (said,) = register_landmarks(MODEL, CAMERA, arched, at_rest=True).warnings
+    assert isinstance(said, NotAtRest)
+    name, value, unit = said.parameters.replace("=", "").split()
+    assert (name, float(value), unit) == ("arch", pytest.approx(18.0, abs=2.5), "mm")
+    assert said.sigma_px < 1.0
+    assert said.free_px == pytest.approx(0.4, rel=0.3)
+
+
+@pytest.mark.parametrize("wrong", ["clicks", "one click", "lens"])
+def test_small_errors_of_landmarks_at_rest_do_not_accuse_it(wrong):
+    """Clicks of 1 px; of 0.4 px with one that is 4 px off; of 0.4 px with a lens that is 1 px off in the corners."""
+    exact, x = landmarks(State(np.zeros(3), POSE), count=20), [CAMERA.fx, CAMERA.fy]
+    for seed in range(30):
+        rng, off = np.random.default_rng(seed), np.zeros((20, 2))
+        if wrong == "one click":
+            off[rng.integers(20), rng.integers(2)] = 4.0
+        if wrong == "lens":
+            rays = (exact.pixels - [CAMERA.cx, CAMERA.cy]) / x
+            off = 0.005 * rays * (rays**2).sum(axis=1, keepdims=True) * x
+        clicks = (1.0 if wrong == "clicks" else 0.4) * rng.standard_normal((20, 2))
+        found = register_landmarks(MODEL, CAMERA, Landmarks(exact.points, exact.pixels + off + clicks), at_rest=True)
+        assert not any(isinstance(said, NotAtRest) for said in found.warnings)
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_clicks_of_an_object_at_rest_do_not_accuse_it(seed):
     """However inexact they are: three parameters explain a part of any clicks."""

@@ -16,7 +16,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure, check_kind
@@ -39,9 +38,10 @@ from morph_dslam.registration.messages import (
     UnusualSize,
     WrongUnit,
 )
-from morph_dslam.registration.outline_snap import EXCLUDED, LEAST_CHANCE, OutlineSnap, distinct_states
+from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
+from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SIGMA_AT_1M
@@ -146,8 +146,11 @@ def register_landmarks(
     }
     poor_px = max(POOR_FIT * click_px, POOR_SHARE * diagonal)
     moved = None
-    if at_rest and best.sigma_px > poor_px:
-        moved = _not_at_rest(model, camera, bound, pixels, best, click_px)
+    if at_rest:
+        shapes = shape_starts(model) if near is None else []
+        others = list(_starts(shapes, camera, bound, pixels))
+        least_share = 0.0 if best.sigma_px > poor_px else MOVED_SHARE
+        moved = not_at_rest(estimator, bound, pixels, best, others, click_px, least_share)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
     covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
     variance, normals = max(click_px, best.sigma_px) ** 2, np.zeros_like(pixels)
@@ -451,34 +454,6 @@ def _contradicted(
             found.append((_rms(estimate), row, float(np.linalg.norm(pixels[row] - there))))
     agreeing, row, away = min(found, default=(np.inf, 0, 0.0))
     return (row, away, agreeing) if agreeing <= limit else None
-
-
-def _not_at_rest(
-    model: ReducedModel, camera: Camera, bound: BoundPoints, pixels: Array, resting: Estimate, click_px: float
-) -> NotAtRest | None:
-    """That the object is hardly at rest, where landmarks fit better otherwise than by chance; None if it may be.
-
-    The statistic is F of the parameters that are set free, given the error that the landmarks show then.
-    """
-    free, d = _estimator(model, camera, at_rest=True), len(model.study_parameters)
-    lower, upper = free.box.lower.copy(), free.box.upper.copy()
-    lower[:d], upper[:d] = model.lower[:d], model.upper[:d]
-    free.box = replace(free.box, lower=lower, upper=upper)
-    freedom = 2 * len(bound) - 6 - d
-    if not d or freedom < 1:
-        return None
-    best = _estimates(free, bound, pixels, [resting.state, *_starts(shape_starts(model), camera, bound, pixels)])[0]
-    ratio = (resting.cost - best.cost) / max(best.cost, freedom * LEAST_PX**2 / 2.0) * freedom / d
-    if fdtrc(d, freedom, max(ratio, 0.0)) > LEAST_CHANCE:
-        return None
-    away = (best.state.parameters - model.default)[:d] ** 2 > EXCLUDED * np.diag(best.covariance)[:d]
-    found = zip(model.study_parameters, best.state.parameters[:d], away, strict=True)
-    given = ", ".join(
-        f"{p.name} = {p.display(v):.2g} {p.unit}".removesuffix(" 1") for p, v, is_away in found if is_away
-    )
-    if not given:
-        return None
-    return NotAtRest(resting.sigma_px, click_px, float(np.sqrt(2.0 * best.cost / freedom)), given)
 
 
 def _warnings(

@@ -104,7 +104,7 @@ class PoorFit(RegistrationWarning):
 
 @dataclass(frozen=True)
 class NotAtRest(PoorFit):
-    """The landmarks fit worse than carefully set ones, and the object is hardly at rest, as it was said to be.
+    """The landmarks fit clearly better where the object is deformed, which was said to be at rest.
 
     Attributes
     ----------
