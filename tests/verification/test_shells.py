@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solvers.buckling import buckling_modes
 from morph_dslam.mechanics.solvers.newton import sensitivities
 from morph_dslam.meshing.surface_generators import plate
@@ -360,6 +361,30 @@ def test_a_cloth_whose_ends_have_come_together_by_default_hangs_as_a_catenary(wi
     np.testing.assert_allclose(
         snapshot.outputs["force_x_max"], [weight * a, 0.0, weight * length / 2.0], rtol=0.02, atol=1e-9
     )
+
+
+def test_a_cloth_by_two_corners_that_have_come_together_by_default_is_refused_with_what_builds():
+    """Its defaults are to be those of corners at rest, from where it is found."""
+    text = """
+        mesh = { generator = "plate", size = ["150 mm", "150 mm"], divisions = [1, 1] }
+        shell = { thickness = "2 mm" }
+        material = { young = "1 MPa", poisson = 0.3, density = "1100 kg/m3" }
+        loads = [{ kind = "gravity", acceleration = ["0 m/s2", "0 m/s2", "-9.81 m/s2"] }]
+        parameters = { close = { range = ["0 mm", "25 mm"], default = "DEFAULT mm" } }
+        supports = [
+            { kind = "fixed", on = "left" },
+            { kind = "displacement", on = "right", x = "-1 * close", y = "0 mm", z = "0 mm" },
+        ]
+        [sets]
+        left.nearest = ["0 mm", "150 mm", "0 mm"]
+        right.nearest = ["150 mm", "150 mm", "0 mm"]
+    """
+    with pytest.raises(SolverError, match=r"Supports have moved at the defaults already: .* at which they are at rest"):
+        shell_study(text.replace("DEFAULT", "10")).sweep_problem().first_state()
+    sweep = shell_study(text.replace("DEFAULT", "0")).sweep_problem()
+    weight = 1100.0 * 2e-3 * 0.15**2 * 9.81
+    snapshot = sweep.take_snapshot(sweep.first_state())
+    assert snapshot.outputs["force_left"][2] == pytest.approx(weight / 2.0, rel=1e-6)
 
 
 def test_the_euler_load_of_a_clamped_strip():

@@ -68,6 +68,11 @@ class ShellSweep(SolidSweep):
             if not state.negative_pivots or not problem.loads:
                 return state
             unstable = unstable or found
+        if unstable is None and len(ways) > 1:
+            raise SolverError(
+                f"{failure}. Supports have moved at the defaults already: include in the ranges, and make the "
+                "defaults, values at which they are at rest"
+            ) from failure
         if unstable is None:
             raise failure
         return self._with_slopes(unstable)
