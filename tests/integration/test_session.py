@@ -1,5 +1,6 @@
 """Several objects, several cameras, and what goes with them, on rendered sheets with known states."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -210,6 +211,16 @@ def test_each_object_has_a_run_folder_and_all_that_one_object_has(model, two_she
             state = states(time)[name]
             exact = state.camera_from_object.apply(model.positions(state.parameters))
             assert np.linalg.norm(run.camera_points(row) - exact, axis=1).mean() < 0.5e-3
+
+
+def test_an_object_in_the_place_of_another_one_is_named_as_such(two_sheets, tmp_path, capsys):
+    """It shows no corner of its own, however sharp the frame is."""
+    arguments = with_two_sheets(two_sheets, tmp_path / "run")
+    twice = [two_sheets / "behind_0.csv" if word == two_sheets / "before_0.csv" else word for word in arguments]
+    assert run_command(twice) == 2
+    assert re.search(
+        r"other objects hide (100|[5-9][0-9])% of the object in the reference frame", capsys.readouterr().err
+    )
 
 
 # Several cameras of wide lenses, so that one by itself tells little along its sight line; 0.4 m apart.

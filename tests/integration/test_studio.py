@@ -115,6 +115,10 @@ def test_the_pages_are_whole_and_load_nothing_from_elsewhere(client):
         assert client.ask("GET", f"/{name}")[0] == 404
 
 
+def test_an_object_that_is_not_there_is_named(client):
+    assert client.refused("load_object", file="gone.inp", unit="mm").startswith("gone.inp is not in the project")
+
+
 def test_a_repaired_surface_is_named(tmp_path):
     ball = trimesh.creation.icosphere(2, radius=20.0)
     trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False).export(tmp_path / "ball.obj")

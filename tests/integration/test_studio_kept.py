@@ -182,6 +182,23 @@ def test_landmarks_are_those_of_an_undeformed_object_only_where_somebody_says_so
     assert "--at-rest" not in started_command(client)
 
 
+def test_landmarks_of_another_object_are_named_when_they_come(tracked):
+    """The sheet lies in z = 0, and the corners of a block 40 mm above it."""
+    client, folder = tracked
+    own = (folder / "landmarks.csv").read_bytes()
+    rows = [f"{x},{y},40,{300 + x},{200 + y}" for x in (0, 80) for y in (0, 20, 40)]
+    others = "\n".join(["x_mm,y_mm,z_mm,u_px,v_px", *rows, ""]).encode()
+    status, _, said = client.ask("PUT", "/api/upload/landmarks/landmarks.csv", others)
+    state = client.state()
+    assert status == 200
+    for note in (json.loads(said)["note"], state["notes"]["start"]):
+        assert re.search(r"landmarks.csv does not fit model.morph: landmark 1 at .* is 40.0 mm off", note)
+    assert not state["done"]["start"]
+    _, _, said = client.ask("PUT", "/api/upload/landmarks/landmarks.csv", own)
+    assert json.loads(said)["note"] is None
+    assert client.state()["done"]["start"]
+
+
 def test_every_page_is_told_of_another_recording(tracked, videos):
     client, _ = tracked
     uploaded = []

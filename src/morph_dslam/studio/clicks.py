@@ -266,6 +266,20 @@ def _top(path: Path) -> float:
     return next(iter(tops.values()), in_mm)
 
 
+def landmarks_problem(model_path: Path, path: Path) -> str | None:
+    """Why the object of a model cannot be placed by a file of landmarks, as `morph track` says; None if it may be."""
+    return _landmarks_problem(model_path, path, stamp(model_path), stamp(path))
+
+
+@lru_cache(maxsize=2)
+def _landmarks_problem(model_path: Path, path: Path, of_model: tuple[int, int], seal: tuple[int, int]) -> str | None:
+    try:
+        bind_landmarks(opened_model(model_path), load_landmarks(path).points)
+    except RegistrationError as error:
+        return f"{path.name} does not fit {model_path.name}: {error}"
+    return None
+
+
 def save_clicks(pairs: Sequence[Sequence[float]], target: Path) -> None:
     """Write pairs as the file of landmarks that `morph track` takes."""
     save_landmarks(target, landmarks_of(pairs))

@@ -98,6 +98,8 @@ def _outside(path: Path, unit: str, size: float | None, stamp: tuple[int, int]) 
 
 
 def _opened(path: Path, unit: str, size: float | None) -> _Outside:
+    if not path.is_file():
+        raise StudioError(f"{path.name} is not in the project: upload it as an object first")
     found = path.stat()
     return _outside(path, unit, size, (found.st_mtime_ns, found.st_size))
 

@@ -96,13 +96,14 @@ class Steps:
         """The files of the project, what was chosen, what each step has, and the job."""
         has, project = self.project.has, self.project
         problem, wrong_camera = await self._run_problem(), await self._camera_problem()
+        wrong_start = await self._start_problem()
         is_tracked = has(f"{names.RUN}/summary.json") and problem is None
         done = {
             "object": has(names.MESH),
             "study": has(names.STUDY) and not (await self.study())["problems"],
             "build": has(names.MODEL),
             "camera": has(names.CAMERA) and self.project.recording is not None and wrong_camera is None,
-            "start": self.scan.is_accepted if self.scan.is_chosen else has(names.LANDMARKS),
+            "start": self.scan.is_accepted if self.scan.is_chosen else has(names.LANDMARKS) and wrong_start is None,
             "track": is_tracked,
             "results": is_tracked,
         }
@@ -113,7 +114,12 @@ class Steps:
             "done": done,
             "job": self._jobs.content(),
             "phone": self.phone_address(),
-            "notes": {"settings": project.damage, "start": project.aside, "run": problem, "camera": wrong_camera},
+            "notes": {
+                "settings": project.damage,
+                "start": project.aside or wrong_start,
+                "run": problem,
+                "camera": wrong_camera,
+            },
         }
         for name, path, read in (
             ("camera", names.CAMERA, clicks.camera_facts),
@@ -176,7 +182,8 @@ class Steps:
             project.choose(object=None, sets=None)
         elif kind in ("recording", "frame"):
             self._take_recording(name if kind == "recording" else names.FRAMES, replaces)
-        return {"name": name, "note": project.aside if kind in ("recording", "frame") else None}
+        note = await self._start_problem() if kind == "landmarks" else None
+        return {"name": name, "note": project.aside if kind in ("recording", "frame") else note}
 
     async def _check_upload(self, kind: str, part: Path, path: Path) -> None:
         try:
@@ -368,6 +375,17 @@ class Steps:
         pairs = await self._worker.call(clicks.read_clicks, self.project.path(names.LANDMARKS))
         chosen = self.project.choices
         return {"pairs": pairs, "frame": chosen.get("reference_frame"), "at_rest": chosen.get("at_rest", False)}
+
+    async def _start_problem(self) -> str | None:
+        """Why the landmarks do not belong to the model; None if they may, or if either is not there."""
+        project = self.project
+        if self.scan.is_chosen or not (project.has(names.LANDMARKS) and project.has(names.MODEL)):
+            return None
+        try:
+            model, landmarks = project.path(names.MODEL), project.path(names.LANDMARKS)
+            return await self._worker.call(clicks.landmarks_problem, model, landmarks)
+        except StudioError:
+            return None  # one of them cannot be read, which is said of it
 
     async def model_mesh(self) -> bytes:
         """The undeformed surface of the model."""

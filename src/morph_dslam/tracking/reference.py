@@ -178,6 +178,8 @@ class PosedImage:
 #: Points do not count where the surface is seen this much flatter than in their picture: next to nothing is left of
 #: their patches, and what is beside the surface fills the rest.
 LEAST_BROADNESS = 0.1
+#: An object of which other ones hide more than this share, and which shows too few corners, is not blurred.
+MOSTLY_HIDDEN = 0.5
 
 
 def _on_texture(picture: Image, places: Array) -> NDArray[np.bool_]:
@@ -399,12 +401,25 @@ class ReferenceView:
             none = SurfacePoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
             return [BoundPoints.from_surface(model, none) for _ in bound]
         if found < fewest:
+            hidden = self._hidden_share()
+            if hidden > MOSTLY_HIDDEN:
+                raise RegistrationError(
+                    f"other objects hide {hidden:.0%} of the object in the reference frame, too much to follow it: "
+                    "give each object its own place, or take a reference frame that shows it",
+                    RegistrationFailure.FEW_CORNERS,
+                )
             raise RegistrationError(
                 f"the object shows only {found} corners in the reference frame, too few to follow it: "
                 "take a sharper reference frame, give the object a printed texture, or use its outline (--outline)",
                 RegistrationFailure.FEW_CORNERS,
             )
         return bound
+
+    def _hidden_share(self) -> float:
+        """Which part of what the object covers in the pictures shows something else."""
+        drawn = [self._drawn(view.state) for view in self._views]
+        shown = sum(np.count_nonzero(view.shown(one)[0]) for view, one in zip(self._views, drawn, strict=True))
+        return 1.0 - shown / max(sum(np.count_nonzero(one.covered) for one in drawn), 1)
 
     def _correlation(self) -> Correlation:
         """Of the points' errors (p, p): those of one picture share what their windows do."""
