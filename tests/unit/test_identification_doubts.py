@@ -249,6 +249,56 @@ def test_points_that_are_displacements_or_in_other_units_are_doubted() -> None:
     assert "all points lie" not in text
 
 
+def loaded(loads: list[float], own: float, noise: float = 0.0, seed: int = 0) -> MeasuredPoints:
+    """The corners, stretched by the load times a factor b of 0.5, and by ``own`` that the model does not have.
+
+    The model's stretch is a b, with a known. Each state is measured twice, each time with an error of its own.
+    """
+    at, random = np.repeat(loads, 2), np.random.default_rng(seed)
+    stretched = 0.5 * at + own
+    moved = [CORNERS * [1.0 + a, 1.0, 1.0] + noise * random.normal(size=(4, 3)) for a in stretched]
+    states = [f"{a:g} kg, {'ab'[i % 2]}" for i, a in enumerate(at)]
+    known = {"a": np.repeat(at, 4)}
+    # a b = (1 + x) (1 + y) / 4, in Chebyshev polynomials of x = 2 a - 1 and y = 2 b - 1.
+    indices = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+    functions = ParameterFunctions(np.zeros(2), np.ones(2), indices, np.full((4, 1), 0.25))
+    shape = np.zeros((1, 4, 3))
+    shape[0, :, 0] = CORNERS[:, 0]
+    model = replace(stretched_plate(), displacement=SeparatedField(shape, functions), reactions={})
+    return MeasuredPoints(model, tuple(np.repeat(states, 4)), known, np.tile(CORNERS, (len(at), 1)), np.vstack(moved))
+
+
+def test_states_that_are_missed_are_named_though_the_others_fit() -> None:
+    """A load of its own that the model lacks: what is left of own + (0.5 - b) a by the best b, in each state."""
+    at = np.array([0.0, 0.5, 0.9])
+    table = loaded(at.tolist(), own=0.1)
+    found = identify(table.model, [table], ["b"])
+    (figures,) = summarise(found)["measurements"]
+    b = at @ (0.5 * at + 0.1) / (at @ at)
+    assert found["b"].value == pytest.approx(b, abs=1e-6)
+    # Two of the four corners move, along one axis of three: one value of six.
+    left, moved = np.abs(0.1 + (0.5 - b) * at), 0.5 * at + 0.1
+    assert [s["rms"] for s in figures["states"]] == pytest.approx(np.repeat(1e3 * left / np.sqrt(6), 2), abs=1e-3)
+    assert [s["change_rms"] for s in figures["states"]] == pytest.approx(np.repeat(1e3 * moved / np.sqrt(6), 2))
+    assert [s["known"]["a_mm"] for s in figures["states"]] == pytest.approx(np.repeat(1e3 * at, 2))
+    assert figures["rms"] < 0.25 * figures["change_rms"]
+    text = lines(found)
+    assert "note: states 0 kg, a, 0 kg, b of points changed by 40.8 mm rms, and 40.8 mm of it is missed" in text
+    assert "0.5 kg, a" not in text
+
+
+def test_states_that_hardly_move_are_not_accused() -> None:
+    """Nothing but the error of measurement is in the unloaded states, of which all is missed."""
+    accused = 0
+    for seed in range(6):
+        table = loaded([0.0, 0.05, 0.5, 0.9], own=0.0, noise=0.02, seed=seed)
+        found = identify(table.model, [table], ["b"])
+        (figures,) = summarise(found)["measurements"]
+        assert figures["states"][0]["rms"] == pytest.approx(figures["states"][0]["change_rms"])
+        accused += "of other states" in lines(found)
+    assert accused == 0
+
+
 def test_what_stands_at_an_end_and_could_not_be_found_is_said_to_be_both() -> None:
     """Forces with 200 N of noise, whose best law would be beyond the range."""
     table = forces(of_law(1.6) + 200.0 * np.cos(9.0 * STRETCHES))

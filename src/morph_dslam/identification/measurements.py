@@ -158,6 +158,11 @@ class MeasuredPoints:
         labels = np.unique(self.states, return_inverse=True)[1]
         return np.repeat(labels[:, None], 3, axis=1)[self._present]
 
+    @property
+    def value_states(self) -> tuple[str, ...]:
+        """The state of each value (n,)."""
+        return tuple(np.repeat(np.array(self.states)[:, None], 3, axis=1)[self._present].tolist())
+
     @cached_property
     def _present(self) -> NDArray[np.bool_]:
         return np.isfinite(self.measured)

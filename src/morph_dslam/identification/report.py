@@ -18,6 +18,7 @@ from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.doubts import notices
 from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
 from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
+from morph_dslam.identification.missed_states import missed_state_notes, state_figures
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter
@@ -79,7 +80,7 @@ def _misfit_figures(misfit: Misfit, identified: Sequence[str], moduli: float | N
     if isinstance(measurement, MeasuredForces):
         return figures | _force_figures(misfit, measurement, identified, moduli)
     if isinstance(measurement, MeasuredPoints):
-        figures["span_of_object"] = measurement.span
+        figures |= {"span_of_object": measurement.span, "states": state_figures(misfit, measurement)}
         moved = np.sqrt(3.0) * scale * root_mean_square(misfit.adjustment)
         return figures | ({"moved_rms": moved} if measurement.aligned else {})
     return figures
@@ -220,6 +221,7 @@ def _doubts(each: Mapping[str, Any]) -> list[str]:
             f"note: {name} changed by {each['change_rms']:.3g} {unit} rms, and {each['rms']:.3g} {unit} of it is "
             f"missed: check the units, and {check}"
         )
+    said += missed_state_notes(each)
     span, share = each.get("span_of_object"), each.get("share_of_range")
     if span is not None and span < LEAST_SPAN:
         said.append(
