@@ -355,3 +355,8 @@ def jacobian_determinants(mesh: Mesh, block: CellBlock) -> Array:
     if block.type.dimension == 2:
         return np.linalg.norm(np.cross(jacobians[..., 0], jacobians[..., 1]), axis=-1)
     return np.linalg.det(jacobians)
+
+
+def cell_sizes(mesh: Mesh) -> Array:
+    """Volume (c,) of each cell, m3; of a sheet's cells the area, m2."""
+    return np.concatenate([jacobian_determinants(mesh, block) @ block.type.quadrature()[1] for block in mesh.blocks])

@@ -40,6 +40,7 @@ from morph_dslam.studies.solutions import Snapshots, take_snapshots
 from morph_dslam.studies.study import Study, load_study, study_file, study_mesh_deviation, study_mesh_notes
 from morph_dslam.studies.time_sampling import time_instants
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
+from morph_dslam.studies.weights import announced_mass
 
 #: Fewer held-out solutions than these say nothing of the error.
 FEWEST_HELD_OUT = 4
@@ -174,7 +175,8 @@ def _announce_mesh(study: SolidStudy | ShellStudy) -> list[str]:
     Returned are sentences, printed too, on how the mesh differs from its file.
     """
     mesh = study.solid_mesh() if isinstance(study, SolidStudy) else study.shell_mesh()
-    announce(f"mesh: {described_mesh(mesh)}")
+    mass = announced_mass(study, mesh)
+    announce(f"mesh: {described_mesh(mesh)}" + (f", {mass}" if mass else ""))
     if isinstance(study, SolidStudy):
         for name in mesh.surfaces.keys() - make_mesh(study.mesh).surfaces.keys():
             area, _, _ = faces_figures(mesh, mesh.surfaces[name])

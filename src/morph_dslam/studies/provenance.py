@@ -18,8 +18,10 @@ from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.body_study import BodyStudy
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
+from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.study import Study
+from morph_dslam.studies.weights import density_doubts
 
 #: Packages whose release may change a model; one that is not installed is left out.
 PACKAGES = ("morph-dslam", "ngsolve", "pypardiso", "mkl", "numba", "numpy", "scipy", "trimesh")
@@ -65,7 +67,8 @@ def versions() -> dict[str, str]:
 
 def study_warnings(study: Study) -> list[str]:
     """Sentences on what a study asks for that its elements do not serve, or that is probably not meant."""
-    return [*_locking(study), *study.doubts()] if isinstance(study, BodyStudy) else []
+    weighed = density_doubts(study) if isinstance(study, SolidStudy | ShellStudy) else []
+    return [*_locking(study), *study.doubts(), *weighed] if isinstance(study, BodyStudy) else []
 
 
 def _locking(study: BodyStudy) -> list[str]:
