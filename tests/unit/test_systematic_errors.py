@@ -176,6 +176,25 @@ def test_a_camera_that_was_moved_is_told_from_another_model_by_the_one_shift_of_
     assert shift_of(exact + 0.2 * noise) == 0.0
 
 
+def test_a_parameter_that_is_held_to_a_wrong_value_is_no_shift_of_the_camera(model, estimator, pixels):
+    """The residuals are those of the right parameters, which explain them; the noise alone has a shift by chance."""
+    points, weights = bound(model, REFERENCE, pixels), np.ones(len(pixels))
+    errors = SystematicErrors(estimator, points, [BoundPart(slice(None), REFERENCE, None)], WINDOW, still=True)
+    wrong = replace(LATER, parameters=REFERENCE.parameters)
+    noise = np.random.default_rng(4).standard_normal(pixels.shape)
+    off = CAMERA.project(points.in_camera(LATER)) - CAMERA.project(points.in_camera(wrong))
+    estimate = replace(
+        estimator.estimate(
+            points, CAMERA.project(points.in_camera(wrong)), weights, wrong, prior=held(wrong, estimator)
+        ),
+        state=wrong,
+    )
+    assert np.linalg.norm(off, axis=1).mean() > 2.0
+    assert errors.common_shift(replace(estimate, residuals=off + 0.02 * noise), weights) == 0.0
+    shifted = errors.common_shift(replace(estimate, residuals=off + [6.0, -8.0] + 0.02 * noise), weights)
+    assert shifted == pytest.approx(10.0, rel=0.3)
+
+
 def beyond_reference(model, estimator, pixels, off, push, rng):
     """Of a later frame whose points were bound in the state ``off`` and moved by ``push`` (p, 2); noise is 0.15 px."""
     true_points = bound(model, REFERENCE, pixels)

@@ -75,14 +75,15 @@ class RunWarning(StrEnum):
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
         "frames, first in frame {first}: there the object deforms otherwise, as by something that touches it and is "
         "not in the study (try --unknown-loads, or --discrepancy), by another law, support or shape, a crack or a "
-        "slip, or the camera is another one, or, with --still, it or the support was moved; what is not seen may be "
-        "off by much more than its deviations"
+        "slip, or the camera is another one, or, with --still, it or the support was moved or the registration is off; "
+        "what is not seen may be off by much more than its deviations"
     )
     SHIFTED = (
         "the model leaves up to {largest_px:.1f} px that neighbouring points have in common in {count} of {n_frames} "
         "frames, first in frame {first}, mostly one shift of all points, by up to {shift_px:.1f} px: there the camera "
-        "or the support was moved, or a clamp slips, or else the object deforms otherwise, as by another law or shape; "
-        "track the frames before and after a move apart (--range), or leave out --still"
+        "or the support was moved, or a clamp slips, or the registration is off, which --still keeps in all frames, or "
+        "else the object deforms otherwise, as by another law or shape; track the frames before and after a move apart "
+        "(--range), or leave out --still"
     )
     RIGID_FAILS = (
         "up to {largest_px:.1f} px that neighbouring points have in common are left in {count} of {n_frames} frames, "

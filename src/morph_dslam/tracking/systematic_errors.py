@@ -242,10 +242,10 @@ class SystematicErrors:
         return Unexplained(float(np.sqrt(max(common, 0.0))), float(np.sqrt(total)))
 
     def common_shift(self, estimate: Estimate, weights: Array) -> float:
-        """The one shift of all points, pixels, that with other parameters leaves less than half of the residuals; or 0.
+        """The one shift of all points, pixels, that explains most of the residuals; 0 if none does.
 
-        It is looked for where one pose holds over the sequence: a free one takes it up. ``weights`` (p,) say which
-        points count.
+        With it other parameters leave less than half of what they leave alone, and it is most of the residuals. It is
+        looked for where one pose holds over the sequence: a free one takes it up. ``weights`` (p,) are the points'.
         """
         if not self._still:
             return 0.0
@@ -253,9 +253,11 @@ class SystematicErrors:
         left = frame.residuals[frame.usable].ravel()
         by_parameters = (frame.jacobian * self._estimator.scale)[frame.usable, :, :d].reshape(-1, d)
         columns = np.column_stack([by_parameters, np.tile(np.eye(2), (len(left) // 2, 1))])
+        alone = left - by_parameters @ np.linalg.lstsq(by_parameters, left)[0]
         found = np.linalg.lstsq(columns, left)[0]
-        explained = np.linalg.norm(left - columns @ found) < 0.5 * np.linalg.norm(left)
-        return float(np.linalg.norm(found[d:])) if explained else 0.0
+        shift = float(np.linalg.norm(found[d:]))
+        explained = np.linalg.norm(left - columns @ found) < 0.5 * np.linalg.norm(alone)
+        return shift if explained and shift**2 * len(left) > 0.5 * float(left @ left) else 0.0
 
     @property
     def reference_factor(self) -> float:
