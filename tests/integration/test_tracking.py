@@ -9,6 +9,7 @@ import pytest
 from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, CameraError, RegistrationError, SourceError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import Parameter
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.binding import draw_view, view_of
@@ -133,6 +134,25 @@ def test_what_is_known_still_counts_after_frames_without_the_object(model, film)
             assert result.estimate.state.parameters[0] == pytest.approx(truth.parameters[0], abs=3.0 * sensor_std)
             assert mean_error(model, result.estimate.state, truth) < 0.5e-3
             assert result.estimate.parameter_std[0] < 1.5 * sensor_std
+
+
+def test_where_a_clock_tells_the_time_other_deviations_have_the_mesh_error_of_a_known_time(model, film):
+    """In the certificate a time that may change leaves much of another parameter open, in proportion to the size."""
+    arch, *others = model.parameters
+    time = Parameter(arch.name, "time", "s", arch.lower, arch.upper, arch.default)
+    first, sizes, none = others[0], {"displacement_rms_mm": [1.0], "left_rms_mm": [0.0]}, {arch.name: [0.0]}
+    stated = {"errors": none | {first.name: [5e-3]}} | sizes
+    stated |= {"at_known_time": {"errors": none | {first.name: [1e-5]}} | sizes}
+    timed = replace(model, parameters=(time, *others), certificate={"discretisation": {"parameters": stated}})
+    deviations = []
+    for known in (False, True):
+        tracker, truth = start(timed, film), sheet_state(0.1)
+        if known:
+            tracker.know({arch.name: (truth.parameters[0], 1e-5)})
+        deviations.append(tracker.track(film.frame(truth)).estimate.parameter_std[1])
+    size = 1e3 * np.sqrt(np.mean(np.sum((model.positions(truth.parameters) - model.nodes) ** 2, axis=1)))
+    assert deviations[0] == pytest.approx(5e-3 * size, rel=0.1)
+    assert deviations[1] < 0.1 * deviations[0]
 
 
 @pytest.mark.parametrize("sensor_std", [2e-3, 2e-5])

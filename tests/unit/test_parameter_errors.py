@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.model import Parameter
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.model.parameter_errors import equivalent_errors, parameter_errors
 from morph_dslam.tracking.frame_results import with_model_errors
@@ -115,3 +116,32 @@ def test_others_make_good_what_a_sensor_keeps_a_parameter_from(model, certified)
     expected = plain.covariance.copy()
     expected[:2, :2] += left.T @ left / 2.0
     assert found.covariance == pytest.approx(expected, rel=1e-9)
+
+
+def test_where_the_time_is_known_the_other_parameters_alone_make_the_error_good(model):
+    """The slide is the time: the stretch that comes nearest to the finer shape is a projection."""
+    slide = model.parameters[1]
+    time = Parameter(slide.name, "time", "s", slide.lower, slide.upper, slide.default)
+    timed = replace(model, parameters=(model.parameters[0], time))
+    states = [
+        (mu, displacement(model, mu), displacement(model, meant)) for mu, meant in zip(STATES, MEANT, strict=True)
+    ]
+    entry = parameter_errors(timed, states)
+    timed = replace(timed, certificate={"discretisation": {"parameters": entry}})
+    x = model.nodes[np.unique(model.triangles), 0]
+    errors = [(finer - own)[np.unique(model.triangles), 0] for _, own, finer in states]
+    stretches = np.array([x @ error / (x @ x) for error in errors])
+    known = entry["at_known_time"]
+    assert known["errors"]["stretch"] == pytest.approx(stretches, rel=1e-9)
+    assert known["errors"]["slide"] == [0.0, 0.0]
+    left = [1e3 * np.sqrt(np.mean((error - s * x) ** 2)) for error, s in zip(errors, stretches, strict=True)]
+    assert known["left_rms_mm"] == pytest.approx(left, rel=1e-6)
+    assert "at_known_time" not in parameter_errors(model, states), "no parameter of it is a time"
+
+    mu, found = np.array([0.06, 0.004]), ModelErrors.of(timed)
+    assert found is not None
+    sizes = [np.sqrt(np.mean(np.sum(displacement(model, each) ** 2, axis=1))) for each in (mu, *MEANT)]
+    expected = np.mean((stretches * sizes[0] / sizes[1:]) ** 2)
+    assert found.where_known(np.array([1])).at(mu).parameters == pytest.approx(np.diag([expected, 0.0]), rel=1e-9)
+    for others in ([], [0]):
+        assert found.where_known(np.array(others, dtype=int)).at(mu).parameters[1, 1] > 0.0

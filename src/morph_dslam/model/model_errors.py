@@ -7,7 +7,7 @@ and of the stresses and forces that follow from these. The displacement is off b
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +43,16 @@ class ModelErrors:
     reduction : by its reduction, if that is known.
     constant : (d,) which parameters are found from all frames together.
     n_loads : unknown loads among the last parameters; the reduction adds nothing to them.
+    clocks : numbers of the parameters that may be the time.
+    mesh_at_known_time : as ``mesh``, where the time is known.
     """
 
     mesh: ParameterErrors | None
     reduction: ReductionErrors | None
     constant: NDArray[np.bool_]
     n_loads: int
+    clocks: tuple[int, ...] = ()
+    mesh_at_known_time: ParameterErrors | None = None
 
     @classmethod
     def of(cls, model: ReducedModel, constant: Collection[str] = ()) -> ModelErrors | None:
@@ -57,7 +61,12 @@ class ModelErrors:
         if mesh is None and reduction is None:
             return None
         kept = np.array([parameter.name in constant for parameter in model.parameters], dtype=bool)
-        return cls(mesh, reduction, kept, model.n_loads)
+        return cls(mesh, reduction, kept, model.n_loads, model.clocks, ParameterErrors.of(model, at_known_time=True))
+
+    def where_known(self, known: NDArray[np.int64]) -> ModelErrors:
+        """The same where the parameters of these numbers (k,) are known, by a clock or by sensors."""
+        has_time = len(self.clocks) == 1 and self.clocks[0] in known
+        return replace(self, mesh=self.mesh_at_known_time) if has_time else self
 
     def at(self, mu: Array) -> ModelDeviation:
         """In the state ``mu`` (d,), SI."""

@@ -23,13 +23,15 @@ Array = NDArray[np.float64]
 ENTRY, ERRORS, SIZES, LEFT = "parameters", "errors", "displacement_rms_mm", "left_rms_mm"
 #: Within the latter those of a model with its unknown loads, which take up what the parameters leave.
 WITH_LOADS = "with_unknown_loads"
+#: And those of a model whose time a clock tells, so that the other parameters alone make the error good.
+AT_KNOWN_TIME = "at_known_time"
 #: Unknown loads are found from a surface that is measured to this part of the object's extent, by many points.
 MEASURED = 1e-5
 #: Combinations of parameters that move the surface by less than this part of what others do are left out.
 LEAST_EFFECT = 1e-3
 
 
-def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> tuple[Array, float]:
+def equivalent_errors(model: ReducedModel, mu: Array, error: Array, known: Sequence[int] = ()) -> tuple[Array, float]:
     """Parameters' changes that move the surface most nearly as an error of the displacement does, and what is left.
 
     Unknown loads among the parameters are as likely as their energy has it.
@@ -39,6 +41,7 @@ def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> tuple[Arr
     model : whose sensitivities are taken.
     mu : (d,) the state, SI.
     error : (n, 3) true displacement minus the model's, at the nodes, metres.
+    known : numbers of the parameters that do not change.
 
     Returns
     -------
@@ -48,6 +51,7 @@ def equivalent_errors(model: ReducedModel, mu: Array, error: Array) -> tuple[Arr
     nodes, ranges = np.unique(model.triangles), np.array([p.upper - p.lower for p in model.parameters])
     _, slopes = model.fields["displacement"].value_and_sensitivities(mu)
     effects = slopes[:, nodes].reshape(len(ranges), -1).T * ranges
+    effects[:, list(known)] = 0.0
     rows, wanted = effects, error[nodes].ravel()
     if model.energy is not None:
         extent = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
@@ -74,9 +78,13 @@ def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, A
     dict
         "errors", by parameter, of each state, SI; "displacement_rms_mm" of the surface there; "left_rms_mm" of the
         displacement's error that no change of the parameters makes good. Of a model that may have unknown loads,
-        "with_unknown_loads" is the same where these make it good too.
+        "with_unknown_loads" is the same where these make it good too. Of a model of one time, "at_known_time" is the
+        same where the other parameters alone do: time may stand for a load almost as well in the state that was solved
+        again, and not at other times.
     """
     found = _entry(model, states)
+    if len(model.clocks) == 1 and len(model.parameters) > 1:
+        found[AT_KNOWN_TIME] = _entry(model, states, model.clocks)
     if model.unknown_loads is not None and model.energy is None:
         none = np.zeros(model.unknown_loads.count)
         found[WITH_LOADS] = _entry(
@@ -85,9 +93,12 @@ def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, A
     return found
 
 
-def _entry(model: ReducedModel, states: Sequence[tuple[Array, Array, Array]]) -> dict[str, Any]:
+def _entry(
+    model: ReducedModel, states: Sequence[tuple[Array, Array, Array]], known: Sequence[int] = ()
+) -> dict[str, Any]:
+    """By those parameters that are not ``known``."""
     nodes = np.unique(model.triangles)
-    matched = [equivalent_errors(model, mu, finer - own) for mu, own, finer in states]
+    matched = [equivalent_errors(model, mu, finer - own, known) for mu, own, finer in states]
     found = np.array([changes for changes, _ in matched])
     errors = {parameter.name: found[:, k].tolist() for k, parameter in enumerate(model.parameters)}
     return {
@@ -128,12 +139,13 @@ class ParameterErrors:
     n_loads: int = 0
 
     @classmethod
-    def of(cls, model: ReducedModel) -> ParameterErrors | None:
-        """Those of a model; None where its certificate states none."""
+    def of(cls, model: ReducedModel, at_known_time: bool = False) -> ParameterErrors | None:
+        """Those of a model, perhaps those where its time is known; None where its certificate states none."""
         stated = model.certificate.get("discretisation", {}).get(ENTRY)
         if stated is None or not model.parameters:
             return None
         stated = stated.get(WITH_LOADS, stated) if model.n_loads else stated
+        stated = stated.get(AT_KNOWN_TIME, stated) if at_known_time else stated
         sizes, none = 1e-3 * np.array(stated[SIZES]), [0.0] * len(stated[SIZES])
         left = 1e-3 * np.array(stated.get(LEFT, none))
         errors = np.array([stated[ERRORS].get(p.name, none) for p in model.parameters]).T

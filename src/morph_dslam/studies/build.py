@@ -149,10 +149,11 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
         announce("reducing the responses to unknown loads")
         loads, model.certificate["unknown_loads"] = reduce_unknown_loads(chosen, chosen.unknown_loads, snapshots)
         model = replace(model, unknown_loads=loads)
+    # Before the discretisation, whose errors depend on which parameter is the time.
+    model.provenance.update(provenance(text, chosen, model))
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.thread_time() - begin)
     if isinstance(chosen, SolidStudy) and (deviation := study_mesh_deviation(chosen, chosen.solid_mesh())):
         model.certificate["mesh_deviation"] = deviation
-    model.provenance.update(provenance(text, chosen, model))
     doubts = _unstrained(snapshots) or _doubtful(model)
     if isinstance(chosen, ExternalStudy):
         doubts += chosen.doubts([*(group[0] for group in snapshots.training), *snapshots.held_out])

@@ -221,7 +221,7 @@ class Tracker:
             systematic, measured = self._view.systematic, self.estimator.known.indices
             held = None if systematic is None or not len(measured) else systematic.held(measured)
             change = self._choose_view(image, hypothesis, result)
-            result = with_model_errors(result, self._model_errors, held)
+            result = with_model_errors(result, self._errors_now(), held)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
@@ -445,10 +445,15 @@ class Tracker:
 
     def deformation_errors(self) -> OffByFactors | None:
         """By how much what the deformation moves points by may be off in the last frame; None where that is unknown."""
-        systematic, errors = self._view.systematic, self._model_errors
+        systematic, errors = self._view.systematic, self._errors_now()
         if systematic is None:
             return None
         return systematic.deformation_errors(self._last, None if errors is None else errors.in_common)
+
+    def _errors_now(self) -> ModelErrors | None:
+        """Those of the model, by what is known in this frame."""
+        errors = self._model_errors
+        return None if errors is None else errors.where_known(self.estimator.known.indices)
 
     @property
     def jumps(self) -> tuple[DisplacementJump, ...]:
