@@ -129,7 +129,9 @@ class RunWarning(StrEnum):
         "about it out of the surface of [unknown_loads], or do not rely on these forces"
     )
     REFERENCE_WIDENED = (
-        "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that"
+        "deviations are {factor:.1f} times wider than the registration alone would have them: the frames ask for that, "
+        "where landmarks are less exact than stated, or where something acts that the study lacks, a contact, a load "
+        "or another support, or the law is off; these errors may be larger still"
     )
     AT_BOUND = (
         "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} {frames}: the object may be "
