@@ -136,8 +136,9 @@ def test_what_is_known_still_counts_after_frames_without_the_object(model, film)
             assert result.estimate.parameter_std[0] < 1.5 * sensor_std
 
 
-def test_where_a_clock_tells_the_time_other_deviations_have_the_mesh_error_of_a_known_time(model, film):
+def test_where_a_clock_tells_the_time_other_deviations_have_the_mesh_error_of_a_known_time(model):
     """In the certificate a time that may change leaves much of another parameter open, in proportion to the size."""
+    film = SheetFilm(model)
     arch, *others = model.parameters
     time = Parameter(arch.name, "time", "s", arch.lower, arch.upper, arch.default)
     first, sizes, none = others[0], {"displacement_rms_mm": [1.0], "left_rms_mm": [0.0]}, {arch.name: [0.0]}

@@ -244,8 +244,9 @@ class SystematicErrors:
     def common_shift(self, estimate: Estimate, weights: Array) -> float:
         """The one shift of all points, pixels, that explains most of the residuals; 0 if none does.
 
-        With it other parameters leave less than half of what they leave alone, and it is most of the residuals. It is
-        looked for where one pose holds over the sequence: a free one takes it up. ``weights`` (p,) are the points'.
+        With it other parameters leave less than half of what they leave alone, and it is half as large as the residuals
+        or larger. It is looked for where one pose holds over the sequence: a free one takes it up. ``weights`` (p,) are
+        the points'.
         """
         if not self._still:
             return 0.0
