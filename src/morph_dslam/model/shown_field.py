@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import ParameterError
 from morph_dslam.model.reduced_model import MaterialPoints, ReducedModel, equivalent_strain, von_mises
 from morph_dslam.model.separated import SeparatedField
+from morph_dslam.model.stated_errors import stated_stresses
 
 Array = NDArray[np.float64]
 Shown = Literal["stress", "strain", "displacement", "traction"]
@@ -53,8 +54,7 @@ _SMALL_STRESSES = {1e-4: ShownKind(STRESS, "Pa", "Pa", 1.0), 0.1: ShownKind(STRE
 
 def shown_kind(model: ReducedModel, show: Shown) -> ShownKind:
     """How a field of a model is called: stress that stays small, by the model's certificate, in kPa or Pa."""
-    stated = [model.certificate.get(f"stress_{place}", {}).get("von_mises", {}) for place in model.stresses]
-    largest = max((entry.get("largest_MPa") or 0.0 for entry in stated), default=0.0)
+    largest = max((entry.get("largest_MPa") or 0.0 for entry in stated_stresses(model)), default=0.0)
     if show == "stress" and largest > 0.0:
         return next((kind for below, kind in _SMALL_STRESSES.items() if largest < below), SHOWN[show])
     return SHOWN[show]

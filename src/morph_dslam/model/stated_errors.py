@@ -18,6 +18,11 @@ MOST = 0.1
 NOT_ESTIMATED, ESTIMABLE = "not_estimated", "estimable"
 
 
+def stated_stresses(model: ReducedModel) -> list[dict[str, Any]]:
+    """What the certificate has of the von Mises stress at each place; empty where it has nothing."""
+    return [model.certificate.get(f"stress_{place}", {}).get("von_mises", {}) for place in model.stresses]
+
+
 def doubtful_errors(model: ReducedModel) -> dict[str, float]:
     """Errors of the reduction above `MOST`, relative, by what they are of: "von Mises stress", "forces".
 
@@ -26,14 +31,13 @@ def doubtful_errors(model: ReducedModel) -> dict[str, float]:
     """
     size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
     stated = model.certificate
-    stresses = [stated.get(f"stress_{place}", {}).get("von_mises", {}) for place in model.stresses]
     reactions = {name: stated.get(REACTION + name, {}) for name in model.reactions}
     forces = [(entry, "largest_N", 1.0) for name, entry in reactions.items() if name.startswith(FORCE)]
     moments = [(entry, "largest_Nmm", 1e-3 / size) for name, entry in reactions.items() if name.startswith(MOMENT)]
     moved = [(stated.get("displacement", {}), "largest_mm", 1.0)]
     kinds = {
         "displacements": moved,
-        "von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stresses],
+        "von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stated_stresses(model)],
         "forces": [*forces, *moments],
     }
     errors = {kind: _largest(entries) for kind, entries in kinds.items()}

@@ -147,8 +147,7 @@ def register_landmarks(
     poor_px = max(POOR_FIT * click_px, POOR_SHARE * diagonal)
     moved = None
     if at_rest:
-        shapes = shape_starts(model) if near is None else []
-        others = list(_starts(shapes, camera, bound, pixels))
+        others = _starts(shape_starts(model) if near is None else [], camera, bound, pixels)
         least_share = 0.0 if best.sigma_px > poor_px else MOVED_SHARE
         moved = not_at_rest(estimator, bound, pixels, best, others, click_px, least_share)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.

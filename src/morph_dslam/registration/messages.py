@@ -166,12 +166,12 @@ class ShapeAgainstPose(RegistrationWarning):
 
     Attributes
     ----------
-    parameters : those that are told badly, with their standard deviations and units.
-    other_aids : that also tell the pose, and were not used.
+    parameters : those that the frame hardly shows, with their standard deviations and units.
+    other_aids : that also fix the pose, and were not used.
     """
 
     template: ClassVar[str] = (
-        "shapes in a wide range, each with a pose of its own, fit this frame: {parameters}. What else tells the pose "
+        "shapes in a wide range, each with a pose of its own, fit this frame: {parameters}. What fixes the pose "
         "narrows that: --still where camera and supports stand still, {other_aids}, or a start with the object at rest "
         "(--at-rest)"
     )

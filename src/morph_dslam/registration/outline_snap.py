@@ -162,8 +162,7 @@ class OutlineSnap:
         state, sigma, variance, redundancy, k = start, self._sigma, 1.0, 1.0, len(self._pixels)
         for reach in REACHES:
             seen = self._agreeing(outline.measure(self._grey, state, reach), state)
-            now = self._measured(seen, sigma, redundancy * variance)
-            estimate = self._estimator.estimate(now.points, now.pixels, now.weights, state, now.normals)
+            estimate = self._estimator.estimate(*self._measured(seen, sigma, redundancy * variance).at(state))
             balance, state = OutlineBalance(), estimate.state
             balance.learn_outline(seen, estimate.residuals[k:], self._n_unknowns)
             if np.isfinite(balance.outline.variance):
@@ -211,8 +210,7 @@ class OutlineSnap:
     ) -> Snap:
         k, n, ones = len(self._pixels), self._n_unknowns, np.ones(len(self._pixels))
         measured = self._measured(seen, sigma, redundancy * variance)
-        all_of_it = measured.points, measured.pixels, measured.weights, estimate.state, measured.normals
-        hessian = self._estimator.evaluate(*all_of_it)[1]
+        hessian = self._estimator.evaluate(*measured.at(estimate.state))[1]
         alone, beside = (
             self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0]
             for state in (by_landmarks, estimate.state)

@@ -50,6 +50,10 @@ class MeasuredPoints:
     normals: Array
     variance: float
 
+    def at(self, state: State) -> tuple[BoundPoints, Array, Array, State, Array]:
+        """What `Estimator.estimate`, `minimum` and `evaluate` take, beside a state."""
+        return self.points, self.pixels, self.weights, state, self.normals
+
     def spread_of_plausible(self, best: State, covariance: Array) -> Array:
         """The covariance of an estimate, wider where plausible states are spread wider than its linear theory says.
 
@@ -98,7 +102,7 @@ class MeasuredPoints:
             lower, upper = box.lower.copy(), box.upper.copy()
             lower[k] = upper[k] = value
             held.box = replace(box, lower=lower, upper=upper)
-            found = held.minimum(self.points, self.pixels, self.weights, state, self.normals)
+            found = held.minimum(*self.at(state))
             state = found.state
             increment = pose_increment(best.camera_from_object, state.camera_from_object)
             yield np.concatenate([state.parameters - best.parameters, increment]), found.cost

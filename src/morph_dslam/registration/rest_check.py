@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,7 @@ def not_at_rest(
     bound: BoundPoints,
     pixels: Array,
     resting: Estimate,
-    others: list[State],
+    others: Iterable[State],
     click_px: float,
     least_share: float,
 ) -> NotAtRest | None:
@@ -39,7 +40,7 @@ def not_at_rest(
     estimator : of the object at rest.
     bound, pixels : the landmarks.
     resting : what they give at rest.
-    others : states to start from beside that.
+    others : states to start from beside that; they are made only if they are needed.
     click_px : standard deviation of a carefully set landmark.
     least_share : of the object's size, by which its surface must move.
     """
@@ -56,9 +57,8 @@ def not_at_rest(
     best = next((estimate for estimate in found if np.isfinite(estimate.residuals).all()), resting)
     ratio = (resting.cost - best.cost) / max(best.cost, freedom * click_px**2 / 2.0) * freedom / d
     motion = model.positions(best.state.parameters) - model.positions(model.default)
-    if fdtrc(d, freedom, max(ratio, 0.0)) > REST_CHANCE or np.linalg.norm(
-        motion, axis=1
-    ).max() < least_share * np.linalg.norm(np.ptp(model.nodes, axis=0)):
+    moved, size = np.linalg.norm(motion, axis=1).max(), np.linalg.norm(np.ptp(model.nodes, axis=0))
+    if fdtrc(d, freedom, max(ratio, 0.0)) > REST_CHANCE or moved < least_share * size:
         return None
     away = (best.state.parameters - model.default)[:d] ** 2 > EXCLUDED * np.diag(best.covariance)[:d]
     values = zip(model.study_parameters, best.state.parameters[:d], away, strict=True)
