@@ -7,7 +7,6 @@ from scipy.optimize import least_squares
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
-from morph_dslam.tracking.levenberg_marquardt import bounded_step
 from morph_dslam.tracking.reprojection import linearise, products_of_rows, project_with_jacobian
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
@@ -257,24 +256,6 @@ def test_several_starts_return_the_best_first(model, points):
     found = Estimator(model, CAMERA).estimate_from(points, pixels, np.ones(len(points)), [mirrored, TRUTH])
     assert found[0].cost <= found[1].cost
     np.testing.assert_allclose(found[0].state.parameters, TRUTH.parameters, atol=5e-3)
-
-
-def test_bounded_step_is_the_least_of_those_with_the_same_unknowns_held():
-    rng = np.random.default_rng(14)
-    n_held = 0
-    for _ in range(50):
-        root = rng.standard_normal((8, 6))
-        hessian, gradient = root.T @ root + 0.05 * np.eye(6), 3.0 * rng.standard_normal(6)
-        inside = bounded_step(hessian, gradient, np.full(6, -1e3), np.full(6, 1e3))
-        np.testing.assert_allclose(inside, np.linalg.solve(hessian, -gradient), atol=1e-9)
-        lower, upper = -rng.uniform(0.0, 0.8, 6), rng.uniform(0.0, 0.8, 6)
-        lower[0], upper[1] = 0.0, 0.0
-        step = bounded_step(hessian, gradient, lower, upper)
-        assert ((step >= lower) & (step <= upper)).all()
-        free = (step > lower) & (step < upper)
-        np.testing.assert_allclose((hessian @ step + gradient)[free], 0.0, atol=1e-9)
-        n_held += int((~free).sum())
-    assert n_held > 50
 
 
 def pose_prior(information, away=(0.0,) * 6):

@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, nogil=True)
 def bounded_step(hessian, gradient, lower, upper):
-    """Minimiser of the quadratic model, with unknowns that would leave [lower, upper] held at the bound.
+    """Minimiser of the quadratic model between bounds, by a primal active set.
 
-    Starts with all unknowns free and holds those that violate a bound until none does; unknowns already at a
-    bound (zero distance) that the gradient pushes outwards are thereby held from the start.
+    From no step it moves towards the minimiser of the unknowns that are free, up to the first bound on the way, which
+    is then held; at that minimiser the held unknown that gains most by leaving its bound is freed.
 
     Parameters
     ----------
     hessian, gradient : (n, n), positive definite, and (n,)
-    lower, upper : (n,) of the step.
+    lower, upper : (n,) of the step; 0 lies between them.
 
     Returns
     -------
@@ -40,32 +40,59 @@ def bounded_step(hessian, gradient, lower, upper):
     free = np.ones(n, dtype=np.bool_)
     for k in range(n):
         free[k] = not ((lower[k] == 0.0 and gradient[k] > 0.0) or (upper[k] == 0.0 and gradient[k] < 0.0))
-    while free.any():
-        rows = np.flatnonzero(free)
-        matrix, right = np.empty((len(rows), len(rows))), np.empty(len(rows))
-        for a in range(len(rows)):
-            right[a] = -gradient[rows[a]]
-            for k in range(n):
-                if not free[k]:
-                    right[a] -= hessian[rows[a], k] * step[k]
-            for b in range(len(rows)):
-                matrix[a, b] = hessian[rows[a], rows[b]]
-        found = np.linalg.solve(matrix, right)
-        kept = True
-        for a in range(len(rows)):
-            k = rows[a]
-            step[k] = min(max(found[a], lower[k]), upper[k])
-            if step[k] != found[a]:
-                free[k], kept = False, False
-        if kept:
+    # Each bound is met and left a few times at most: the limit only guards against rounding.
+    for _ in range(4 * n + 4):
+        target = _minimiser_of_free(hessian, gradient, step, free)
+        share, first = 1.0, -1
+        for k in range(n):
+            bound = lower[k] if target[k] < lower[k] else upper[k]
+            if target[k] < lower[k] or target[k] > upper[k]:
+                part = (bound - step[k]) / (target[k] - step[k])
+                if part < share:
+                    share, first = part, k
+        step += share * (target - step)
+        if first >= 0:
+            step[first] = lower[first] if target[first] < lower[first] else upper[first]
+            free[first] = False
+            continue
+        slope = gradient + hessian @ step
+        gain, best = 1e-14 * abs(gradient @ step), -1
+        for k in range(n):
+            inwards = -slope[k] if step[k] <= lower[k] else slope[k]
+            if not free[k] and lower[k] < upper[k] and inwards**2 / hessian[k, k] > gain and inwards > 0.0:
+                gain, best = inwards**2 / hessian[k, k], k
+        if best < 0:
             break
+        free[best] = True
     return step
+
+
+@njit(cache=True, nogil=True)
+def _minimiser_of_free(hessian, gradient, step, free):
+    """The step (n,) whose free unknowns minimise the quadratic model, the others as they are."""
+    rows = np.flatnonzero(free)
+    matrix, right = np.empty((len(rows), len(rows))), np.empty(len(rows))
+    for a in range(len(rows)):
+        right[a] = -gradient[rows[a]]
+        for k in range(len(gradient)):
+            if not free[k]:
+                right[a] -= hessian[rows[a], k] * step[k]
+        for b in range(len(rows)):
+            matrix[a, b] = hessian[rows[a], rows[b]]
+    target = step.copy()
+    if len(rows) > 0:
+        found = np.linalg.solve(matrix, right)
+        for a in range(len(rows)):
+            target[rows[a]] = found[a]
+    return target
 
 
 #: Largest step of one iteration in scaled unknowns: keeps an unseen direction from crossing the box at once.
 LARGEST_STEP = 1.0
 #: Damping floor, relative to the best-seen direction.
 DAMPING_FLOOR = 1e-6
+#: Steps back to the bottom of a valley, after one that raised the cost.
+STEPS_BACK = 5
 #: At a state: cost, Gauss-Newton Hessian (d + 6, d + 6), gradient (d + 6,), and residuals of any shape.
 Evaluate = Callable[[State], tuple[float, Array, Array, Array]]
 
@@ -113,31 +140,55 @@ def minimise(evaluate: Evaluate, start: State, box: Box, max_iterations: int = 2
     """Minimise a cost from ``start``, until it would decrease by less than ``tolerance`` of itself."""
     known = start.camera_from_object
     pose = RigidTransform(np.ascontiguousarray(known.rotation), np.ascontiguousarray(known.translation))
-    state, bounds = box.nearest(State(start.parameters, pose)), (box.lower, box.upper, box.scale)
+    state = box.nearest(State(start.parameters, pose))
     cost, hessian, gradient, residuals = evaluate(state)
     damping, iterations, converged = 1e-3, 0, False
     while iterations < max_iterations and not converged:
         iterations += 1
-        pose = state.camera_from_object
-        predicted, *trial = damped_trial(
-            hessian, gradient, state.parameters, pose.rotation, pose.translation, *bounds, damping
-        )
+        predicted, moved = _stepped(state, hessian, gradient, box, damping)
         if predicted <= tolerance * cost + 1e-14:
             # A damped step predicts little although much could be gained: believe it only undamped.
             converged = damping <= 1e-2
             damping = min(damping * 0.01, 1e-2)
             continue
-        parameters, rotation, translation = trial
-        moved = State(parameters, RigidTransform(rotation, translation))
-        attempt = evaluate(moved)
+        moved, attempt = _back_into_valley(evaluate, moved, cost, box, damping)
         if attempt[0] < cost:
             ratio = (cost - attempt[0]) / predicted
             state, (cost, hessian, gradient, residuals) = moved, attempt
             damping = max(damping * (0.1 if ratio > 0.5 else 1.0), 1e-9)
         else:
-            damping *= 10.0
+            damping *= 4.0
             converged = damping > 1e8
     return Minimum(state, cost, hessian, residuals, iterations, converged)
+
+
+def _stepped(state: State, hessian: Array, gradient: Array, box: Box, damping: float) -> tuple[float, State]:
+    """The decrease that a damped step from a state is to bring, and the state that it leads to."""
+    pose = state.camera_from_object
+    predicted, parameters, rotation, translation = damped_trial(
+        hessian, gradient, state.parameters, pose.rotation, pose.translation, box.lower, box.upper, box.scale, damping
+    )
+    return predicted, State(parameters, RigidTransform(rotation, translation))
+
+
+def _back_into_valley(
+    evaluate: Evaluate, state: State, cost: float, box: Box, damping: float
+) -> tuple[State, tuple[float, Array, Array, Array]]:
+    """A state that a step has led to and what `Evaluate` gives there, or where further steps lower the cost enough.
+
+    Parameters that pictures hardly tell apart leave a narrow, curved valley: a straight step along it ends on its
+    side. From there a few more steps lead back to its bottom, farther on (the watchdog of Nocedal & Wright, ch. 15.6).
+    They are made as long as each promises to come below ``cost``.
+    """
+    there = evaluate(state)
+    for _ in range(STEPS_BACK):
+        if there[0] < cost:
+            break
+        predicted, moved = _stepped(state, there[1], there[2], box, damping)
+        if not there[0] - predicted < cost:
+            break
+        state, there = moved, evaluate(moved)
+    return state, there
 
 
 @njit(cache=True, nogil=True)
