@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import main
-from morph_dslam.errors import ModelFileError, StudyError, TrackingError
+from morph_dslam.errors import ModelFileError, StudyError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
@@ -196,7 +196,7 @@ def test_two_structures_of_one_name_are_refused_before_the_tracking(tmp_path):
         landmarks=tmp_path / "landmarks.csv",
         inner=(tmp_path / "a.h5", tmp_path / "b.h5"),
     )
-    with pytest.raises(TrackingError, match=r"two inner structures are called 'tumour', the second one is .*b\.h5"):
+    with pytest.raises(ModelFileError, match=r"two inner structures are called 'tumour', the second one is .*b\.h5"):
         load_objects(run, CAMERA)
 
 

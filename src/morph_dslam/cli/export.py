@@ -1,6 +1,7 @@
 """`morph export`: a model's deformed states for other programs."""
 
 import argparse
+from pathlib import Path
 
 from morph_dslam.cli.arguments import add_file, add_output, add_repeated
 
@@ -27,6 +28,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         command, "--path", "states of the frames of a run, or of the rows of a table (docs/export.md)", "RUN_OR_CSV"
     )
     add_repeated(command, "--at", "value of a parameter that is not varied (default: its default)", "NAME=VALUE")
+    add_repeated(
+        command, "--inner", "with --format vtu or gltf: a structure inside (`morph inner`) to write too", "FILE", Path
+    )
     command.add_argument(
         "--coordinates",
         choices=("object", "camera"),
@@ -47,5 +51,6 @@ def run(arguments: argparse.Namespace) -> None:
         choice,
         arguments.show,
         tell=lambda notice: print(f"note: {notice}"),
+        inner=arguments.inner,
     )
     print(f"wrote {target} and {arguments.output / 'states.csv'}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 from xml.etree import ElementTree
@@ -23,6 +24,7 @@ from morph_dslam.io.gltf import GENERATOR, Colours, write_glb
 from morph_dslam.io.state_choice import EACH_IN_TURN, StateChoice, States, states_of_array
 from morph_dslam.io.writing import removed_on_failure
 from morph_dslam.model import ReducedModel, load_model
+from morph_dslam.model.inner_structure import CarriedStructure, load_inner_structures
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.shown_field import shown_field
 from morph_dslam.notices import Notice
@@ -58,7 +60,8 @@ _MESHIO_CELLS = {
 }  # fmt: skip
 #: Where the nine components of a symmetric tensor stand among xx, yy, zz, yz, xz, xy.
 _FULL_TENSOR = [0, 5, 4, 5, 1, 3, 4, 3, 2]
-#: By what series and animations of exports are known.
+#: How files of structures inside are called behind the model's name, and by what other exports are known.
+_INNER = "inner_"
 _XDMF_SERIES, _GLB_GENERATOR = 'Name="TimeSeries_meshio"', f'"generator":"{GENERATOR} '
 
 
@@ -103,6 +106,16 @@ def fields_of_state(states: States, state: int) -> tuple[Array, dict[str, ArrayL
     return pose.apply(model.nodes), fields
 
 
+def _inner_mesh(states: States, structure: CarriedStructure, state: int) -> meshio.Mesh:
+    """The surface of a structure inside at rest with its displacement; in the camera frame both are turned."""
+    rest, moved = structure.rest, states.inner_displacement(structure, state)
+    if states.poses is not None:
+        pose = RigidTransform.from_matrix(states.poses[state])
+        rest, moved = pose.apply(rest), moved @ pose.rotation.T
+    cells = [("triangle", structure.triangles.astype(np.int32))]
+    return meshio.Mesh(rest, cells, point_data={"displacement": moved.astype(np.float32)})
+
+
 def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock]:
     if not model.cells:
         return [("triangle", model.triangles.astype(np.int32))]
@@ -124,7 +137,8 @@ def _remove_export(folder: Path, stem: str) -> None:
     """
     series, collection, animation = (folder / f"{stem}.{ending}" for ending in ("xdmf", "pvd", "glb"))
     written = [
-        folder / name for name in re.findall(rf'file="({re.escape(stem)}_\d{{4,}}\.vtu)"', _beginning(collection))
+        folder / name
+        for name in re.findall(rf'file="({re.escape(stem)}_(?:{_INNER}\w+_)?\d{{4,}}\.vtu)"', _beginning(collection))
     ]
     found = [*written, collection] if written else []
     head = _beginning(series, _HEAD)
@@ -149,6 +163,8 @@ def _beginning(path: Path, length: int = -1) -> str:
 def write_vtu_series(folder: Path, stem: str, states: States) -> Path:
     """One ``stem_0000.vtu`` a state, ``stem.pvd`` to open all, ``states.csv``; returns the .pvd.
 
+    Structures inside have files of their own, ``stem_inner_NAME_0000.vtu``, and are further parts of the collection.
+
     An interrupt ends the series behind the state that is being written.
     """
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
@@ -159,7 +175,13 @@ def write_vtu_series(folder: Path, stem: str, states: States) -> Path:
             name = f"{stem}_{i:04d}.vtu"
             nodes, fields = fields_of_state(states, i)
             meshio.Mesh(nodes, cells, point_data=fields).write(folder / name)
-            ElementTree.SubElement(collection, "DataSet", timestep=f"{states.times[i]:.15g}", file=name)
+            parts = [name]
+            for structure in states.inner:
+                parts.append(f"{stem}_{_INNER}{_file_name(structure.name)}_{i:04d}.vtu")
+                _inner_mesh(states, structure, i).write(folder / parts[-1])
+            for part, file in enumerate(parts):
+                of_part = {"timestep": f"{states.times[i]:.15g}", "part": str(part), "file": file}
+                ElementTree.SubElement(collection, "DataSet", of_part)
             places.append({"file": name})
             if interrupts.is_waiting:
                 break
@@ -213,6 +235,7 @@ def export(
     choice: StateChoice | ArrayLike = EACH_IN_TURN,
     show: Colours | None = None,
     tell: Callable[[Notice], object] = lambda notice: None,
+    inner: Sequence[str | Path] = (),
 ) -> Path:
     """Write a model's states for ParaView or as an animation; returns the file to open.
 
@@ -227,6 +250,7 @@ def export(
     show : what colours a glTF file: "stress" (von Mises), "strain" (equivalent), "displacement", or "none"; by default
         the stress of a model that has it, else the displacement; of a run with a discrepancy this alone.
     tell : called with each notice of what a reader of the states must know.
+    inner : files of structures inside (`morph inner`), whose surfaces are written too; not with "xdmf".
 
     Raises
     ------
@@ -251,6 +275,10 @@ def export(
         states = States.of(loaded, states_of_array(loaded, choice))
     if states.poses is not None and file_format != "vtu":
         raise ExportError("--coordinates camera needs --format vtu: other files hold the undeformed mesh once")
+    if inner and file_format == "xdmf":
+        raise ExportError("structures inside (--inner) need --format vtu or gltf: an XDMF file holds one mesh")
+    structures = load_inner_structures([Path(path) for path in inner], states.model)
+    states = replace(states, inner=tuple(one.carried_by(states.model) for one in structures))
     show = _shown(states, show) if file_format == "gltf" else None
     folder = Path(folder)
     try:

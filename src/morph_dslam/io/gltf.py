@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from tqdm import tqdm
 from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
 from morph_dslam.io.state_choice import States
-from morph_dslam.model import ReducedModel
+from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 
 Array = NDArray[np.float64]
@@ -32,6 +33,10 @@ Colours = Literal["stress", "strain", "displacement", "none"]
 GENERATOR = "morph-dslam"
 FRAMES_PER_SECOND = 12.0
 COLOUR_MAP = "turbo"
+#: Opacity of a surface that shows what it has inside.
+SEE_THROUGH = 0.4
+#: Colours of structures inside in turn, linear: violet, yellow, green, blue, as in videos.
+_INNER_COLOURS = ([0.83, 0.05, 0.83], [1.0, 0.72, 0.05], [0.1, 0.83, 0.1], [0.05, 0.51, 1.0])
 #: Bytes of a vertex in one state: three floats, and a colour of four 16-bit numbers.
 _VERTEX_BYTES = 20
 #: Lengths in the file are unsigned 32-bit numbers; the rest is left for what is no vertex.
@@ -97,7 +102,7 @@ def write_glb(path: Path, states: States, show: Colours | None = None) -> None:
     """
     buffer, model = _Buffer(), states.model
     if show == "none" or not model.parameters:  # a rigid object has nothing to be coloured by
-        content = _modes(buffer, model, states.parameters)
+        content = _modes(buffer, states)
     else:
         content = _coloured(buffer, states, shown_field(model, show))
     document = {
@@ -118,37 +123,56 @@ def write_glb(path: Path, states: States, show: Colours | None = None) -> None:
         file.writelines(buffer.parts)
 
 
-def _material(colour: list[float]) -> dict[str, Any]:
+def _materials(colour: list[float], inner: Sequence[CarriedStructure]) -> list[dict[str, Any]]:
+    """That of the surface, which structures inside are seen through, and those of the structures."""
+    surface = _material("surface", [*colour[:3], SEE_THROUGH if inner else 1.0])
+    if inner:
+        surface["alphaMode"] = "BLEND"
+    colours = (_INNER_COLOURS[k % len(_INNER_COLOURS)] for k in range(len(inner)))
+    return [surface, *(_material(one.name, [*c, 1.0]) for one, c in zip(inner, colours, strict=True))]
+
+
+def _material(name: str, colour: list[float]) -> dict[str, Any]:
     look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.7}
-    return {"name": "surface", "pbrMetallicRoughness": look, "doubleSided": True}
+    return {"name": name, "pbrMetallicRoughness": look, "doubleSided": True}
 
 
-def _modes(buffer: _Buffer, model: ReducedModel, states: Array) -> dict[str, Any]:
-    """The grey surface at rest, its modes as morph targets, and their weights."""
+def _modes(buffer: _Buffer, states: States) -> dict[str, Any]:
+    """The grey surface at rest, its modes as morph targets, and their weights; structures inside in the same way."""
+    model = states.model
     nodes, triangles = np.unique(model.triangles, return_inverse=True)
-    weights = np.array([model.displacement.functions.evaluate(mu)[0] for mu in states])
-    primitive = {
-        "attributes": {"POSITION": buffer.add(model.nodes[nodes], _VERTICES)},
-        "indices": buffer.add(triangles.ravel(), _INDICES),
-        "material": 0,
-        "targets": [{"POSITION": buffer.add(mode[nodes], _VERTICES)} for mode in model.displacement.modes],
-    }
-    mesh = {
-        "name": model.name,
-        "primitives": [primitive],
-        "weights": weights[0].astype(np.float32).tolist(),
-        "extras": {"targetNames": [f"mode {i + 1}" for i in range(model.displacement.n_modes)]},
-    }
+    weights = np.array([model.displacement.functions.evaluate(mu)[0] for mu in states.parameters])
+
+    def mesh(material: int, name: str, rest: Array, modes: Array, corners: NDArray[np.int64]) -> dict[str, Any]:
+        primitive = {
+            "attributes": {"POSITION": buffer.add(rest, _VERTICES)},
+            "indices": buffer.add(corners.ravel(), _INDICES),
+            "material": material,
+            "targets": [{"POSITION": buffer.add(mode, _VERTICES)} for mode in modes],
+        }
+        return {
+            "name": name,
+            "primitives": [primitive],
+            "weights": weights[0].astype(np.float32).tolist(),
+            "extras": {"targetNames": [f"mode {i + 1}" for i in range(len(modes))]},
+        }
+
+    meshes = [mesh(0, model.name, model.nodes[nodes], model.displacement.modes[:, nodes], triangles)]
+    for k, one in enumerate(states.inner):
+        meshes.append(mesh(k + 1, one.name, one.rest, one.field.modes, one.triangles))
+    top: dict[str, Any] = {"name": model.name, "mesh": 0, "rotation": _Z_UP}
+    if states.inner:
+        top["children"] = list(range(1, len(meshes)))
     content: dict[str, Any] = {
-        "nodes": [{"name": model.name, "mesh": 0, "rotation": _Z_UP}],
-        "meshes": [mesh],
-        "materials": [_material([0.62, 0.68, 0.74, 1.0])],
+        "nodes": [top, *({"name": one["name"], "mesh": k + 1} for k, one in enumerate(meshes[1:]))],
+        "meshes": meshes,
+        "materials": _materials([0.62, 0.68, 0.74], states.inner),
     }
     if len(states) > 1:
         times = np.arange(len(weights)) / FRAMES_PER_SECOND
         sampler = {"input": buffer.add(times), "output": buffer.add(weights.ravel()), "interpolation": "LINEAR"}
-        channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-        content["animations"] = [{"name": "parameters", "samplers": [sampler], "channels": [channel]}]
+        channels = [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(len(meshes))]
+        content["animations"] = [{"name": "parameters", "samplers": [sampler], "channels": channels}]
     return content
 
 
@@ -157,10 +181,11 @@ def _coloured(buffer: _Buffer, states: States, show: Shown) -> dict[str, Any]:
     model = states.model
     points, triangles = surface_points(model)
     rest, field = model.nodes[points.corners[:, 0]], ShownField(model, points, show)
-    size = _VERTEX_BYTES * len(rest) * len(states)
+    count = len(rest) + sum(len(one.rest) for one in states.inner)
+    size = _VERTEX_BYTES * count * len(states)
     if size > _MOST_BYTES:
         raise ExportError(
-            f"{len(states)} states of {len(rest)} coloured points take {size / 2**30:.1f} GB, and a glTF file has "
+            f"{len(states)} states of {count} coloured points take {size / 2**30:.1f} GB, and a glTF file has "
             "4 GB at most: choose fewer states, or --show none, which writes the modes"
         )
     moved = [
@@ -182,12 +207,27 @@ def _coloured(buffer: _Buffer, states: States, show: Shown) -> dict[str, Any]:
         scale = {} if i == 0 else {"scale": [0.0, 0.0, 0.0]}
         nodes.append({"name": f"state {i}", "mesh": i, "translation": middle.tolist(), **scale})
         nodes[0]["children"].append(i + 1)
+    _add_inner(buffer, states, middle, nodes, meshes)
     colours = {"field": field.kind.name, "unit": field.kind.unit, "range": [0.0, top], "colour_map": COLOUR_MAP}
     nodes[0]["extras"] = {"colours": colours}
-    content: dict[str, Any] = {"nodes": nodes, "meshes": meshes, "materials": [_material([1.0] * 4)]}
+    content: dict[str, Any] = {"nodes": nodes, "meshes": meshes, "materials": _materials([1.0] * 3, states.inner)}
     if len(states) > 1:
         content["animations"] = [_turns(buffer, len(states))]
     return content
+
+
+def _add_inner(
+    buffer: _Buffer, states: States, middle: Array, nodes: list[dict[str, Any]], meshes: list[dict[str, Any]]
+) -> None:
+    """Below the node of each state (1, 2, ...) one for each structure inside, shown and hidden with it."""
+    for k, structure in enumerate(states.inner):
+        indices = buffer.add(structure.triangles.ravel(), _INDICES)
+        for i in range(len(states)):
+            at = structure.rest - middle + states.inner_displacement(structure, i)
+            primitive = {"attributes": {"POSITION": buffer.add(at, _VERTICES)}, "indices": indices, "material": k + 1}
+            nodes[i + 1].setdefault("children", []).append(len(nodes))
+            nodes.append({"name": structure.name, "mesh": len(meshes)})
+            meshes.append({"name": f"{structure.name}, state {i}", "primitives": [primitive]})
 
 
 def _turns(buffer: _Buffer, count: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from morph_dslam.errors import ExportError, StudyError
 from morph_dslam.io.run_states import RESULT, RunStates, load_run_states
 from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.unknown_loads import with_unknown_loads
 from morph_dslam.notices import Notice
 from morph_dslam.units import FACTORS, read_quantity, to_si
@@ -143,6 +144,7 @@ class States:
     times : (s,) seconds; the numbers of the states where they have no times.
     discrepancies : of each state what its displacement has beyond the model's; empty where none has any.
     poses : camera_from_object (s, 4, 4) where the states are wanted in the camera frame.
+    inner : structures inside that are wanted too.
     notices : what a reader of the states must know.
     """
 
@@ -152,6 +154,7 @@ class States:
     times: Array
     discrepancies: Sequence[Discrepancy | None] = ()
     poses: Array | None = None
+    inner: tuple[CarriedStructure, ...] = ()
     notices: tuple[Notice, ...] = ()
 
     @classmethod
@@ -166,6 +169,11 @@ class States:
         """What the discrepancy adds to the displacement (n, 3) at positions (n, 3) of the undeformed object, metres."""
         found = self.discrepancies[state] if self.discrepancies else None
         return 0.0 if found is None else found.displacement(positions)
+
+    def inner_displacement(self, structure: CarriedStructure, state: int) -> Array:
+        """Displacement (p, 3) of the nodes of a structure inside, object frame, metres."""
+        moved = structure.field.value(self.parameters[state])
+        return moved + self.beyond_model(state, structure.rest)
 
     def with_run(self, run: RunStates, in_camera: bool) -> States:
         """With the discrepancies of the same states of a run, and their poses where these are wanted."""

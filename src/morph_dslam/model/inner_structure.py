@@ -6,6 +6,7 @@ nothing to the mechanics: a stiff inclusion belongs into the solid's own mesh.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,6 +123,27 @@ def load_inner_structure(path: Path) -> InnerStructure:
             f"{path} is no inner structure that can be read ({error}): make it again with `morph inner`"
         ) from error
     return structure
+
+
+def load_inner_structures(paths: Sequence[Path], model: ReducedModel) -> tuple[InnerStructure, ...]:
+    """Structures inside of one model, each of a name of its own.
+
+    Raises
+    ------
+    ModelFileError
+        If a file cannot be read or is not for this model, or two have one name.
+    """
+    found: dict[str, InnerStructure] = {}
+    for path in paths:
+        structure = load_inner_structure(path)
+        structure.carried_by(model)  # raises if it is not for this model
+        if structure.name in found:
+            raise ModelFileError(
+                f"two inner structures are called '{structure.name}', the second one is {path}: make it again with "
+                "another --name of `morph inner`"
+            )
+        found[structure.name] = structure
+    return tuple(found.values())
 
 
 def _check(structure: InnerStructure) -> None:

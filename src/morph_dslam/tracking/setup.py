@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera, load_rig
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
-from morph_dslam.model.inner_structure import InnerStructure, load_inner_structure
+from morph_dslam.model.inner_structure import InnerStructure, load_inner_structures
 from morph_dslam.notices import Remark
 from morph_dslam.registration.initialization import Initializer, register_by_initializer
 from morph_dslam.registration.landmarks import CLICK_PX, register_landmarks
@@ -134,24 +134,9 @@ def load_objects(run: TrackOptions, camera: Camera) -> list[TrackedObject]:
     return [_load_object(str(name), part, run, scene_of) for name, part in zip(run.folders, run.objects, strict=True)]
 
 
-def _load_inner(paths: Sequence[Path], model: ReducedModel) -> tuple[InnerStructure, ...]:
-    """Structures inside of a model, each of a name of its own."""
-    found: dict[str, InnerStructure] = {}
-    for path in paths:
-        structure = load_inner_structure(path)
-        structure.carried_by(model)  # raises before the tracking if it is not for this model
-        if structure.name in found:
-            raise TrackingError(
-                f"two inner structures are called '{structure.name}', the second one is {path}: make it again with "
-                "another --name of `morph inner`"
-            )
-        found[structure.name] = structure
-    return tuple(found.values())
-
-
 def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Callable[[Path], Scene]) -> TrackedObject:
     initializer, model = part.initializer.load(), load_model(part.model)
-    inner = _load_inner(part.inner, model)
+    inner = load_inner_structures(part.inner, model)
     points = NamedPoints.of(model, part.points)
     known = None if part.known is None else KnownValues.read(part.known, model)
     again = {n: None if path is None else load_landmarks(path) for n, path in part.reregister_at}
