@@ -112,7 +112,7 @@ def _inner_mesh(states: States, structure: CarriedStructure, state: int) -> mesh
     if states.poses is not None:
         pose = RigidTransform.from_matrix(states.poses[state])
         rest, moved = pose.apply(rest), moved @ pose.rotation.T
-    cells = [("triangle", structure.triangles.astype(np.int32))]
+    cells: dict[str, ArrayLike] = {"triangle": structure.triangles.astype(np.int32)}
     return meshio.Mesh(rest, cells, point_data={"displacement": moved.astype(np.float32)})
 
 

@@ -143,7 +143,9 @@ def _modes(buffer: _Buffer, states: States) -> dict[str, Any]:
     nodes, triangles = np.unique(model.triangles, return_inverse=True)
     weights = np.array([model.displacement.functions.evaluate(mu)[0] for mu in states.parameters])
 
-    def mesh(material: int, name: str, rest: Array, modes: Array, corners: NDArray[np.int64]) -> dict[str, Any]:
+    def mesh(
+        material: int, name: str, rest: Array, modes: NDArray[np.floating[Any]], corners: NDArray[np.int64]
+    ) -> dict[str, Any]:
         primitive = {
             "attributes": {"POSITION": buffer.add(rest, _VERTICES)},
             "indices": buffer.add(corners.ravel(), _INDICES),
