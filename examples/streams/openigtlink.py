@@ -4,7 +4,7 @@
 
 with the address that `morph` printed. It listens at this computer's port 18944, where an OpenIGTLink client connects.
 Lengths are in millimetres. OBJECT has the surface in the object's frame, with the value at each vertex in the unit that
-people read; OBJECT_pose takes it into the camera's frame.
+people read; OBJECT_pose takes it into the camera's frame. Structures inside have their own names, and the same frame.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def polydata_body(points: NDArray, triangles: NDArray, name: str = "", values: N
 
 
 def frame_messages(scene: dict[str, Any], frame: dict[str, Any]) -> bytes:
-    """TRANSFORM of each object that is not lost, and POLYDATA of each whose shape is known.
+    """TRANSFORM of each object that is not lost, and POLYDATA of each whose shape is known and of what it has inside.
 
     Parameters
     ----------
@@ -108,6 +108,11 @@ def frame_messages(scene: dict[str, Any], frame: dict[str, Any]) -> bytes:
             label, values = known["scalar"]["name"], values / known["scalar"]["shown_factor"]
         body = polydata_body(1e3 * vertices.reshape(-1, 3), triangles, label, values)
         parts.append(packed("POLYDATA", name, body, seconds))
+        for inner in known["inner"]:
+            array = f"{name}/inner/{inner}"
+            vertices = frame["arrays"][f"{array}/vertices"].reshape(-1, 3)
+            triangles = scene["arrays"][f"{array}/triangles"].reshape(-1, 3)
+            parts.append(packed("POLYDATA", inner, polydata_body(1e3 * vertices, triangles), seconds))
     return b"".join(parts)
 
 

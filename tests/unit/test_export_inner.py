@@ -9,16 +9,13 @@ import pytest
 
 from morph_dslam import StateChoice, export
 from morph_dslam.extend.models import save_inner_structure
-from morph_dslam.extend.studies import place_inner_structure
 from morph_dslam.model import save_model
 from morph_dslam.model.unknown_loads import with_unknown_loads
+from tests.support.inner_structures import NODES, TRIANGLES, inner_structure, moved
 from tests.support.stretched_block import SIZE, stretched_block_model
 from tests.unit.test_export import gltf_array, sizes_at
 from tests.unit.test_export_runs import POSE, STATES, loaded_block, write_run
 
-#: Four points inside of the block, the corners of a tetrahedron.
-NODES = np.array([[0.01, 0.01, 0.01], [0.03, 0.01, 0.02], [0.02, 0.03, 0.02], [0.06, 0.02, 0.03]])
-TRIANGLES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 GRID = StateChoice(vary=["stretch=0:0.2:3"], at=["slide=5"])
 
 
@@ -29,14 +26,8 @@ def folder(tmp_path_factory):
     model = stretched_block_model()
     save_model(folder / "block.morph", model)
     for name, shift in (("tumour", 0.0), ("blood vessel", 0.005)):
-        structure = place_inner_structure(model, name, NODES + shift, TRIANGLES)
-        save_inner_structure(folder / f"{name}.h5", structure)
+        save_inner_structure(folder / f"{name}.h5", inner_structure(model, name, shift))
     return folder
-
-
-def moved(rest, stretch, slide):
-    """u_x = stretch x + slide z / height."""
-    return rest + np.column_stack([stretch * rest[:, 0] + slide * rest[:, 2] / SIZE[2], *np.zeros((2, len(rest)))])
 
 
 def inner_files(folder):
@@ -64,7 +55,7 @@ def test_structures_are_parts_of_a_vtu_collection(folder, tmp_path):
 def test_where_the_camera_saw_a_structure(folder, tmp_path):
     """With unknown loads u_y = q z², u_z = p x, to second order u_x = q² z."""
     model = loaded_block()
-    save_inner_structure(tmp_path / "tumour.h5", place_inner_structure(model, "tumour", NODES, TRIANGLES))
+    save_inner_structure(tmp_path / "tumour.h5", inner_structure(model))
     write_run(tmp_path / "run", with_unknown_loads(model), model)
     choice = StateChoice(path=tmp_path / "run", coordinates="camera")
     export(model, tmp_path / "out", "vtu", choice, inner=[tmp_path / "tumour.h5"])

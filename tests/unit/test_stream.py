@@ -20,6 +20,7 @@ from morph_dslam.extend.studies import build_rigid
 from morph_dslam.streams.messages import ObjectInfo, SceneMessage
 from morph_dslam.streams.websocket import WAITING, WebSocketPublisher
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
+from tests.support.inner_structures import NODES, TRIANGLES, inner_structure, moved
 from tests.support.rendered_sequence import CAMERA
 from tests.support.streamed import (
     DEVIATIONS,
@@ -95,6 +96,21 @@ def test_the_scene_says_what_will_be_tracked(publisher, sink, model):
     # Outward triangles enclose the block's volume.
     volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
     assert volume == pytest.approx(np.prod(SIZE), rel=1e-6)
+
+
+def test_structures_inside_move_with_the_object(publisher, model):
+    sink = StreamSink([publisher])
+    sink.begin({"block": StreamedObject(model, inner=[inner_structure(model).carried_by(model)])}, CAMERA)
+    scene, received = next(client.messages(publisher.place)), taking(publisher)
+    assert scene["objects"][0]["inner"] == ["tumour"]
+    np.testing.assert_allclose(scene["arrays"]["block/inner/tumour/rest"].reshape(-1, 3), NODES, atol=1e-9)
+    np.testing.assert_array_equal(scene["arrays"]["block/inner/tumour/triangles"].reshape(-1, 3), TRIANGLES)
+    stretch, slide = STATES[0]
+    sink(tracked_frame(0, 0.0, block=tracked_result(model, stretch, slide)))
+    vertices = next(received)["arrays"]["block/inner/tumour/vertices"].reshape(-1, 3)
+    np.testing.assert_allclose(vertices, moved(NODES, stretch, slide), atol=1e-8)
+    sink(tracked_frame(1, 0.1, block=lost_result(model)))
+    assert not any("inner" in name for name in next(received)["arrays"])
 
 
 def test_a_frame_has_the_values_of_the_closed_form(publisher, sink, model):

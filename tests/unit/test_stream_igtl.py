@@ -11,8 +11,9 @@ import pyigtl
 import pytest
 from pyigtl import messages as igtl
 
-from morph_dslam.extend.streams import StreamSink
+from morph_dslam.extend.streams import StreamedObject, StreamSink
 from morph_dslam.streams.websocket import WebSocketPublisher
+from tests.support.inner_structures import NODES, TRIANGLES as INSIDE, inner_structure, moved
 from tests.support.rendered_sequence import CAMERA
 from tests.support.streamed import (
     POSE,
@@ -52,12 +53,15 @@ class PolyData(igtl.MessageBase):
     def _unpack_content(self, content):
         n_points, *counts, n_attributes = struct.unpack_from(">10I", content)
         n_vertices, _, n_lines, _, n_polygons, polygon_bytes, n_strips, _ = counts
-        assert (n_vertices, n_lines, n_strips, n_attributes) == (0, 0, 0, 1)
+        assert (n_vertices, n_lines, n_strips) == (0, 0, 0)
         place = 40
         self.points = np.frombuffer(content, ">f4", 3 * n_points, place).reshape(-1, 3)
         place += 12 * n_points
         self.polygons = np.frombuffer(content, ">u4", polygon_bytes // 4, place).reshape(n_polygons, -1)
         place += polygon_bytes
+        if not n_attributes:
+            assert place == len(content)
+            return
         kind, components, n_values = struct.unpack_from(">BBI", content, place)
         assert (kind, components, n_values) == (0, 1, n_points)
         end = content.index(b"\0", place + 6)
@@ -79,17 +83,18 @@ def test_values_at_the_points(name):
     np.testing.assert_array_equal(data.values, values.astype(np.float32))
 
 
-def test_a_client_receives_pose_surface_and_stress(monkeypatch):
+def test_a_client_receives_pose_surface_stress_and_what_is_inside(monkeypatch):
     """From the tracker's results by WebSocket and by OpenIGTLink to pyigtl's client."""
     monkeypatch.setitem(igtl.message_type_to_class_constructor, "POLYDATA", PolyData)
     model, publisher, server = held_block_model(), WebSocketPublisher(), socket.create_server(("127.0.0.1", 0))
-    sink = StreamSink([publisher]).begin({"block": model}, CAMERA)
+    inner = [inner_structure(model).carried_by(model)]
+    sink = StreamSink([publisher]).begin({"block": StreamedObject(model, inner=inner)}, CAMERA)
     relay = threading.Thread(target=sample.relay, args=(publisher.place, server))
     relay.start()
     viewer = pyigtl.OpenIGTLinkClient("127.0.0.1", server.getsockname()[1])
     stretch, slide, received, number, end = 0.1, 0.004, {}, 0, time.monotonic() + 30.0
     try:
-        while set(received) != {"block_pose", "block"}:
+        while set(received) != {"block_pose", "block", "tumour"}:
             assert time.monotonic() < end
             sink(tracked_frame(number, 12.25, block=tracked_result(model, stretch, slide)))
             number += 1
@@ -106,5 +111,8 @@ def test_a_client_receives_pose_surface_and_stress(monkeypatch):
     np.testing.assert_allclose(pose.matrix[:3, 3], 1e3 * POSE.translation, atol=1e-4)
     np.testing.assert_allclose(surface.points, 1e3 * vertices_at(model, stretch, slide), atol=1e-4)
     np.testing.assert_array_equal(surface.polygons[:, 1:], model.triangles)
+    inside = received["tumour"]
+    np.testing.assert_allclose(inside.points, 1e3 * moved(NODES, stretch, slide), atol=1e-4)
+    np.testing.assert_array_equal(inside.polygons[:, 1:], INSIDE)
     assert surface.name == "von Mises stress"
     np.testing.assert_allclose(surface.values, 1e-6 * stress_at(stretch, slide), rtol=1e-5)

@@ -11,6 +11,7 @@ from morph_dslam.errors import StreamError
 from morph_dslam.extend.streams import StreamedObject, StreamSink
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.sinks import TrackedFrame
+from tests.support.inner_structures import NODES, TRIANGLES, inner_structure, moved
 from tests.support.rendered_sequence import CAMERA
 from tests.support.streamed import (
     DEVIATIONS,
@@ -68,8 +69,25 @@ def test_the_mesh_moves_in_the_camera_frame(recorded):
         np.testing.assert_allclose(found[block, "translation"][10 + number][0], POSE.translation, atol=1e-7)
         values = found["/values/block", "von Mises stress [Pa]"][10 + number]
         np.testing.assert_allclose(values, stress_at(stretch, slide), rtol=1e-5)
-        assert len(set(found[block, "vertex_colors"][10 + number])) == 1
+        (colour,) = set(found[block, "vertex_colors"][10 + number])
+        assert colour & 0xFF == 255
     assert list(found[block, "is_recursive"]) == [13]
+
+
+def test_structures_inside_are_seen_through_the_mesh(tmp_path):
+    path, model = tmp_path / "run.rrd", held_block_model()
+    with StreamSink([f"rerun:{path}"]) as streams:
+        inner = [inner_structure(model).carried_by(model)]
+        streams.begin({"run": StreamedObject(model, "block", inner=inner)}, CAMERA)
+        streams(tracked_frame(0, 0.0, run=tracked_result(model, *STATES[0])))
+        streams(tracked_frame(1, 0.5, run=lost_result(model)))
+    found, inside = columns(path), "/world/objects/block/inner/tumour"
+    np.testing.assert_array_equal(found[inside, "triangle_indices"][None], TRIANGLES)
+    np.testing.assert_allclose(found[inside, "vertex_positions"][0], moved(NODES, *STATES[0]), atol=1e-8)
+    assert list(found[inside, "is_recursive"]) == [1]
+    # Colours are 0xRRGGBBAA.
+    assert [colour & 0xFF for colour in found[inside, "albedo_factor"][None]] == [255]
+    assert {colour & 0xFF for colour in found["/world/objects/block", "vertex_colors"][0]} == {102}
 
 
 def test_parameters_forces_and_status_over_the_frames(recorded):

@@ -15,6 +15,7 @@ from morph_dslam.errors import StreamError
 from morph_dslam.extend.streams import StreamedObject, StreamSink
 from morph_dslam.streams.destinations import open_destination
 from morph_dslam.streams.ros2_messages import build, topics
+from tests.support.inner_structures import NODES, TRIANGLES, inner_structure, moved
 from tests.support.rendered_sequence import CAMERA
 from tests.support.streamed import (
     DEVIATIONS,
@@ -81,7 +82,8 @@ def round_trip(store, message):
 def told(request):
     """What each topic carries of a tracked frame and of a lost one, and the definitions."""
     kept, model, store = Kept(), held_block_model(), get_typestore(request.param)
-    sink = StreamSink([kept]).begin({"run": StreamedObject(model, "my block")}, CAMERA)
+    inner = [inner_structure(model, "blood vessel").carried_by(model)]
+    sink = StreamSink([kept]).begin({"run": StreamedObject(model, "my block", inner=inner)}, CAMERA)
     sink(tracked_frame(4, 12.25, run=tracked_result(model, STRETCH, SLIDE)))
     sink(tracked_frame(5, 12.5, run=lost_result(model)))
     found = []
@@ -116,6 +118,18 @@ def test_pose_and_frames(told):
     assert {"/morph/my_block/pose", "/tf"} & set(lost) == set()
 
 
+def test_structures_inside(told):
+    tracked, lost, store, _ = told
+    topic, kind = "/morph/my_block/inner/blood_vessel", store.types["visualization_msgs/msg/Marker"]
+    marker = tracked[topic]
+    assert (marker.type, marker.action, marker.ns) == (kind.TRIANGLE_LIST, kind.ADD, "my block/blood vessel")
+    corners = moved(NODES, STRETCH, SLIDE)[TRIANGLES.ravel()]
+    np.testing.assert_allclose([xyz(point) for point in marker.points], corners, atol=1e-8)
+    assert xyz(marker.pose.position) == pytest.approx(POSE.translation)
+    assert (marker.color.a, marker.colors) == (1.0, [])
+    assert (lost[topic].action, lost[topic].ns) == (kind.DELETE, marker.ns)
+
+
 def test_the_mesh(told):
     tracked, lost, store, model = told
     marker, kind = tracked["/morph/my_block/mesh"], store.types["visualization_msgs/msg/Marker"]
@@ -125,11 +139,11 @@ def test_the_mesh(told):
     assert xyz(marker.pose.position) == pytest.approx(POSE.translation)
     corners = vertices_at(model, STRETCH, SLIDE)[model.triangles.ravel()]
     np.testing.assert_allclose([xyz(point) for point in marker.points], corners, atol=1e-7)
-    # One stress everywhere: one colour, opaque, and not that of the low end, violet.
+    # One stress everywhere: one colour, through which one sees what is inside, and not that of the low end, violet.
     colours = np.array([[c.r, c.g, c.b, c.a] for c in marker.colors])
     assert len(colours) == len(corners)
     assert np.ptp(colours, axis=0).max() == 0.0
-    assert colours[0, 3] == 1.0
+    assert colours[0, 3] == pytest.approx(0.4)
     assert colours[0, 1] > colours[0, 2]
     assert lost["/morph/my_block/mesh"].action == kind.DELETE
     assert lost["/morph/my_block/mesh"].ns == "my block"

@@ -2,6 +2,7 @@
 
 from morph_dslam.streams.messages import (
     FrameMessage as FrameMessage,
+    InnerInfo as InnerInfo,
     ObjectInfo as ObjectInfo,
     ObjectMessage as ObjectMessage,
     ParameterInfo as ParameterInfo,

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from morph_dslam._version import __version__
 from morph_dslam.errors import ExportError
 from morph_dslam.io.state_choice import States
-from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.model.inner_structure import SEE_THROUGH, CarriedStructure, colour_of
 from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 
 Array = NDArray[np.float64]
@@ -33,10 +33,6 @@ Colours = Literal["stress", "strain", "displacement", "none"]
 GENERATOR = "morph-dslam"
 FRAMES_PER_SECOND = 12.0
 COLOUR_MAP = "turbo"
-#: Opacity of a surface that shows what it has inside.
-SEE_THROUGH = 0.4
-#: Colours of structures inside in turn, linear: violet, yellow, green, blue, as in videos.
-_INNER_COLOURS = ([0.83, 0.05, 0.83], [1.0, 0.72, 0.05], [0.1, 0.83, 0.1], [0.05, 0.51, 1.0])
 #: Bytes of a vertex in one state: three floats, and a colour of four 16-bit numbers.
 _VERTEX_BYTES = 20
 #: Lengths in the file are unsigned 32-bit numbers; the rest is left for what is no vertex.
@@ -128,7 +124,7 @@ def _materials(colour: list[float], inner: Sequence[CarriedStructure]) -> list[d
     surface = _material("surface", [*colour[:3], SEE_THROUGH if inner else 1.0])
     if inner:
         surface["alphaMode"] = "BLEND"
-    colours = (_INNER_COLOURS[k % len(_INNER_COLOURS)] for k in range(len(inner)))
+    colours = (_linear(np.array(colour_of(k)) / 255.0).tolist() for k in range(len(inner)))
     return [surface, *(_material(one.name, [*c, 1.0]) for one, c in zip(inner, colours, strict=True))]
 
 
@@ -245,10 +241,14 @@ def _turns(buffer: _Buffer, count: int) -> dict[str, Any]:
 
 
 def _linear_colours(shares: Array) -> NDArray[np.uint16]:
-    """Colours (n, 4) of shares (n,) of the range; glTF's are linear, those of colour maps sRGB (IEC 61966-2-1)."""
+    """Colours (n, 4) of shares (n,) of the range."""
     import matplotlib  # it takes long to load, and not all who import this draw
 
     srgb = matplotlib.colormaps[COLOUR_MAP](np.clip(shares, 0.0, 1.0))
-    rgb = srgb[:, :3]
-    srgb[:, :3] = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    srgb[:, :3] = _linear(srgb[:, :3])
     return np.round(65535 * srgb).astype(np.uint16)
+
+
+def _linear(rgb: Array) -> Array:
+    """Colours as glTF has them, linear, of those in sRGB (IEC 61966-2-1); both from 0 to 1."""
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

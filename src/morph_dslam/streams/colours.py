@@ -8,7 +8,8 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.streams.messages import ScalarInfo
+from morph_dslam.model.inner_structure import SEE_THROUGH
+from morph_dslam.streams.messages import ObjectInfo
 
 #: Of values that are not a number, and of rigid objects.
 GREY = np.array([128, 128, 128, 255], dtype=np.uint8)
@@ -20,16 +21,19 @@ def colour_map() -> NDArray[np.uint8]:
     return np.asarray(matplotlib.colormaps["turbo"](np.arange(256), bytes=True))
 
 
-def colours_of(values: NDArray | None, info: ScalarInfo | None, count: int) -> NDArray[np.uint8]:
-    """Colours (n, 4) of values (n,), grey where there is none.
+def colours_of(values: NDArray | None, info: ObjectInfo, count: int) -> NDArray[np.uint8]:
+    """Colours (n, 4) of values (n,) on an object, grey where there is none, see-through where it has structures inside.
 
     Parameters
     ----------
     values : (n,), NaN where a value does not hold; None for an object without values.
-    info : what they are; None for an object without values.
+    info : the object.
     count : number of vertices, n.
     """
-    if values is None or info is None:
-        return np.tile(GREY, (count, 1))
-    shares = np.nan_to_num(np.clip((values - info.low) / (info.high - info.low), 0.0, 1.0))
-    return np.where(np.isfinite(values)[:, None], colour_map()[np.rint(255 * shares).astype(int)], GREY)
+    colours, scalar = np.tile(GREY, (count, 1)), info.scalar
+    if values is not None and scalar is not None:
+        shares = np.nan_to_num(np.clip((values - scalar.low) / (scalar.high - scalar.low), 0.0, 1.0))
+        colours = np.where(np.isfinite(values)[:, None], colour_map()[np.rint(255 * shares).astype(int)], GREY)
+    if info.inner:
+        colours[:, 3] = round(255 * SEE_THROUGH)
+    return colours

@@ -66,6 +66,22 @@ class ScalarInfo:
 
 
 @dataclass(frozen=True)
+class InnerInfo:
+    """What does not change of a structure inside an object.
+
+    Attributes
+    ----------
+    name : of the structure.
+    rest : (p, 3) vertices of its undeformed surface, object frame, metres.
+    triangles : (m, 3) in these vertices.
+    """
+
+    name: str
+    rest: Array
+    triangles: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
 class ObjectInfo:
     """What does not change of an object.
 
@@ -79,6 +95,7 @@ class ObjectInfo:
     parameters : in the order of the values in a frame.
     scalar : the field that colours it; None for a rigid object.
     supports : names of those that have reactions.
+    inner : structures inside.
     """
 
     name: str
@@ -89,6 +106,7 @@ class ObjectInfo:
     parameters: tuple[ParameterInfo, ...]
     scalar: ScalarInfo | None
     supports: tuple[str, ...]
+    inner: tuple[InnerInfo, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -143,6 +161,7 @@ class ObjectMessage:
     vertices : (n, 3) deformed surface, object frame, metres; None unless tracked.
     scalar : (n,) of the field that colours it, NaN where it does not hold; None unless tracked, or if it has none.
     reactions : by support; empty unless tracked.
+    inner : deformed vertices (p, 3) of structures inside by their names, object frame, metres; empty unless tracked.
     """
 
     name: str
@@ -155,6 +174,7 @@ class ObjectMessage:
     vertices: NDArray[np.float32] | None = None
     scalar: NDArray[np.float32] | None = None
     reactions: dict[str, ReactionMessage] = field(default_factory=dict)
+    inner: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,9 @@ def scene_packet(scene: SceneMessage, colours: list[list[int]]) -> bytes:
         arrays[f"{part.name}/rest"] = part.rest
         arrays[f"{part.name}/triangles"] = part.triangles
         arrays[f"{part.name}/nodes"] = part.nodes
+        for one in part.inner:
+            arrays[f"{part.name}/inner/{one.name}/rest"] = one.rest
+            arrays[f"{part.name}/inner/{one.name}/triangles"] = one.triangles
     facts = {
         "protocol": PROTOCOL,
         "version": VERSION,
@@ -46,6 +49,7 @@ def frame_packet(message: FrameMessage) -> bytes:
             arrays[f"{part.name}/vertices"] = part.vertices
         if part.scalar is not None:
             arrays[f"{part.name}/scalar"] = part.scalar
+        arrays |= {f"{part.name}/inner/{name}/vertices": vertices for name, vertices in part.inner.items()}
     facts = {
         "type": "frame",
         "number": message.number,
@@ -69,6 +73,7 @@ def _object_facts(part: ObjectInfo) -> dict[str, Any]:
         "parameters": [asdict(parameter) for parameter in part.parameters],
         "scalar": None if part.scalar is None else asdict(part.scalar),
         "supports": list(part.supports),
+        "inner": [one.name for one in part.inner],
     }
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Maps
 from morph_dslam.errors import StreamError
+from morph_dslam.model.inner_structure import colour_of
 from morph_dslam.streams.colours import colours_of
 from morph_dslam.streams.messages import FrameMessage, ObjectInfo, ObjectMessage, SceneMessage
 
@@ -83,7 +84,9 @@ class RerunPublisher:
         )  # fmt: skip
         self._log_static("world/camera", pinhole)
         for part in scene.objects:
-            self._log_static(f"world/objects/{_entity(part.name)}", _rest(part))
+            self._log_static(f"world/objects/{_entity(part.name)}", _mesh_of(part.triangles))
+            for number, one in enumerate(part.inner):
+                self._log_static(_inner_entity(part, one.name), _mesh_of(one.triangles, colour_of(number)))
 
     def _log_static(self, entity: str, archetype: Any) -> None:
         self._recording.log(entity, archetype, static=True)
@@ -130,11 +133,15 @@ class RerunPublisher:
         recording, name = self._recording, _entity(info.name)
         entity, pose = f"world/objects/{name}", now.camera_from_object
         if now.vertices is None or pose is None:
-            recording.log(entity, rr.Clear(recursive=False))
+            for gone in (entity, *(_inner_entity(info, one.name) for one in info.inner)):
+                recording.log(gone, rr.Clear(recursive=False))
         else:
-            colours = colours_of(now.scalar, info.scalar, len(now.vertices))
+            colours = colours_of(now.scalar, info, len(now.vertices))
             recording.log(entity, rr.Transform3D(translation=pose.translation, mat3x3=pose.rotation))
             recording.log(entity, rr.Mesh3D.from_fields(vertex_positions=now.vertices, vertex_colors=colours))
+            for structure, vertices in now.inner.items():
+                inside = rr.Mesh3D.from_fields(vertex_positions=vertices)
+                recording.log(_inner_entity(info, structure), inside)
             if now.scalar is not None and info.scalar is not None:
                 values = {f"{info.scalar.name} [{info.scalar.unit}]": now.scalar}
                 recording.log(f"values/{name}", rr.AnyValues(drop_untyped_nones=True, **values))
@@ -162,9 +169,14 @@ def _check_viewer(address: str) -> None:
         ) from error
 
 
-def _rest(part: ObjectInfo) -> rr.Mesh3D:
-    """The triangles, which do not change."""
-    return rr.Mesh3D.from_fields(triangle_indices=part.triangles.astype(np.uint32))
+def _mesh_of(triangles: NDArray[np.int64], colour: tuple[int, int, int] | None = None) -> rr.Mesh3D:
+    """What does not change of a surface: its triangles, and the colour of a structure inside."""
+    return rr.Mesh3D.from_fields(triangle_indices=triangles.astype(np.uint32), albedo_factor=colour)
+
+
+def _inner_entity(part: ObjectInfo, structure: str) -> str:
+    """Where a structure inside an object is logged: below the object, with whose pose it moves."""
+    return f"world/objects/{_entity(part.name)}/inner/{_entity(structure)}"
 
 
 def _entity(name: str) -> str:

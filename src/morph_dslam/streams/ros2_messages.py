@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.model.inner_structure import colour_of
 from morph_dslam.streams.colours import colours_of
 from morph_dslam.streams.messages import FrameMessage, ObjectInfo, ObjectMessage, SceneMessage
 
@@ -139,6 +140,8 @@ class _ObjectTopics:
     def __init__(self, info: ObjectInfo, base: str, camera: str, frame: str) -> None:
         self._info, self._base, self._camera, self._frame = info, base, camera, frame
         self._supports = dict(zip(info.supports, _unique(info.supports), strict=True))
+        inner = [one.name for one in info.inner]
+        self._inner = dict(zip(inner, _unique(inner), strict=True))
 
     def topics(self, number: int) -> dict[str, Topic]:
         """By name; ``number`` is that of the object in the frames."""
@@ -152,6 +155,10 @@ class _ObjectTopics:
             f"{self._base}/vertices": topic("sensor_msgs/msg/PointCloud2", self._vertices),
             f"{self._base}/parameters": topic("std_msgs/msg/Float64MultiArray", self._parameters),
         }
+        for order, (structure, name) in enumerate(self._inner.items()):
+            found[f"{self._base}/inner/{name}"] = topic(
+                "visualization_msgs/msg/Marker", self._inner_of(order, structure)
+            )
         for support, name in self._supports.items():
             found[f"{self._base}/reactions/{name}"] = topic("geometry_msgs/msg/WrenchStamped", self._wrench_of(support))
         return found
@@ -196,24 +203,46 @@ class _ObjectTopics:
 
     def _mesh(self, message: FrameMessage, now: ObjectMessage) -> RosMessage:
         """Triangles in colours for RViz; taken away while the shape is not known."""
-        fields: dict[str, Any] = {"header": _header(message, self._camera), "ns": self._info.name}
-        if now.vertices is None or now.camera_from_object is None:
-            return RosMessage("visualization_msgs/msg/Marker", fields | {"action": DELETE})
+        if now.vertices is None:
+            return self._marker(message, now, self._info.name)
         corners = self._info.triangles.ravel()
-        colours = colours_of(now.scalar, self._info.scalar, len(now.vertices)) / 255.0
-        points = [
-            RosMessage("geometry_msgs/msg/Point", dict(zip("xyz", p, strict=True))) for p in now.vertices.tolist()
-        ]
-        shades = [RosMessage("std_msgs/msg/ColorRGBA", dict(zip("rgba", c, strict=True))) for c in colours.tolist()]
+        shades = [_colour(one) for one in (colours_of(now.scalar, self._info, len(now.vertices)) / 255.0).tolist()]
+        coloured = {"color": _colour([1.0] * 4), "colors": [shades[corner] for corner in corners]}
+        return self._marker(message, now, self._info.name, (now.vertices, corners), coloured)
+
+    def _inner_of(self, order: int, structure: str) -> Callable[[FrameMessage, ObjectMessage], RosMessage]:
+        """A structure inside, in one colour."""
+        corners, name = self._info.inner[order].triangles.ravel(), f"{self._info.name}/{structure}"
+        coloured = {"color": _colour([*(part / 255.0 for part in colour_of(order)), 1.0])}
+
+        def marker(message: FrameMessage, now: ObjectMessage) -> RosMessage:
+            if structure not in now.inner:
+                return self._marker(message, now, name)
+            return self._marker(message, now, name, (now.inner[structure], corners), coloured)
+
+        return marker
+
+    def _marker(
+        self,
+        message: FrameMessage,
+        now: ObjectMessage,
+        name: str,
+        surface: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None,
+        coloured: dict[str, Any] | None = None,
+    ) -> RosMessage:
+        """A marker of triangles, by vertices (n, 3) and the corners (3 m,) in them; without these it is taken away."""
+        fields: dict[str, Any] = {"header": _header(message, self._camera), "ns": name}
+        if surface is None or now.camera_from_object is None:
+            return RosMessage("visualization_msgs/msg/Marker", fields | {"action": DELETE})
+        vertices, corners = surface
+        points = [RosMessage("geometry_msgs/msg/Point", dict(zip("xyz", p, strict=True))) for p in vertices.tolist()]
         fields |= {
             "type": TRIANGLE_LIST,
             "pose": _pose(now.camera_from_object),
             "scale": _vector(np.ones(3)),
-            "color": RosMessage("std_msgs/msg/ColorRGBA", dict.fromkeys("rgba", 1.0)),
             "points": [points[corner] for corner in corners],
-            "colors": [shades[corner] for corner in corners],
         }
-        return RosMessage("visualization_msgs/msg/Marker", fields)
+        return RosMessage("visualization_msgs/msg/Marker", fields | (coloured or {}))
 
     def _vertices(self, message: FrameMessage, now: ObjectMessage) -> RosMessage | None:
         """The vertices in the object's frame, and the value at each."""
@@ -275,6 +304,10 @@ def _header(message: FrameMessage, frame: str) -> RosMessage:
     return RosMessage(
         "std_msgs/msg/Header", {"stamp": RosMessage("builtin_interfaces/msg/Time", stamp), "frame_id": frame}
     )
+
+
+def _colour(rgba: Sequence[float]) -> RosMessage:
+    return RosMessage("std_msgs/msg/ColorRGBA", dict(zip("rgba", rgba, strict=True)))
 
 
 def _vector(values: NDArray) -> RosMessage:

@@ -19,7 +19,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
-from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.model.inner_structure import SEE_THROUGH, CarriedStructure, colour_of
 from morph_dslam.model.reduced_model import MaterialPoints
 from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 from morph_dslam.registration.mesh_edges import SPACING, MeshEdges
@@ -167,10 +167,8 @@ def _edges(cells: NDArray[np.int64], pairs: list[tuple[int, int]]) -> NDArray[np
     return np.stack([cells[:, list(pair)] for pair in pairs], axis=1)
 
 
-#: Opacity of the object's surface, of one that shows what it has inside, and of one that is cut open.
-OPACITY, SEE_THROUGH, CUT_OPEN = 0.65, 0.4, 0.9
-#: Colours of inner structures in turn: violet, yellow, green, blue.
-INNER_COLOURS = ((235, 60, 235), (60, 220, 255), (90, 235, 90), (255, 190, 60))
+#: Opacity of the object's surface, and of one that is cut open.
+OPACITY, CUT_OPEN = 0.65, 0.9
 #: Direction to the light, camera frame, and what it leaves in the shade.
 LIGHT, AMBIENT = np.array([0.3, -0.4, -1.0]), 0.55
 
@@ -311,12 +309,13 @@ class AugmentedView:
             if discrepancy is not None:
                 nodes = nodes + discrepancy.displacement(structure.rest)
             nodes = state.camera_from_object.apply(nodes)
+            red, green, blue = colour_of(number)
             drawn = draw_inner_surface(
                 drawn,
                 self._camera.project(nodes),
                 nodes[:, 2],
                 structure.triangles,
-                INNER_COLOURS[number % len(INNER_COLOURS)],
+                (blue, green, red),
                 label=structure.name,
                 brightness=lambert(vertex_normals(nodes, structure.triangles), LIGHT, AMBIENT),
             )

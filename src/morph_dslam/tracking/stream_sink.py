@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import StreamError
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.shown_field import Shown, ShownField, shown_field, surface_points
 from morph_dslam.streams.destinations import open_destination
 from morph_dslam.streams.messages import (
     FrameMessage,
+    InnerInfo,
     ObjectInfo,
     ObjectMessage,
     ParameterInfo,
@@ -46,6 +48,7 @@ class StreamedObject:
     show : what colours it; None for the stress of a model that has it, else the displacement.
     modulus_std : standard deviation of a factor common to all moduli: it counts in the reactions.
     field : what colours the surface, where it is drawn as well; None to make one.
+    inner : structures inside that are sent too.
     """
 
     model: ReducedModel
@@ -53,6 +56,7 @@ class StreamedObject:
     show: Shown | None = None
     modulus_std: float = 0.0
     field: ShownField | None = None
+    inner: Sequence[CarriedStructure] = ()
 
 
 class StreamSink:
@@ -150,6 +154,7 @@ class _ObjectMessages:
         kind = shown_field(model, streamed.show)
         self._rest, self._modulus_std = model.rest_positions(points), streamed.modulus_std
         self._field, self._reactions = streamed.field or ShownField(model, points, kind), Reactions(model)
+        self._inner = tuple(streamed.inner)
         self._covers_jumps, self._si_factor = kind == "displacement", self._field.kind.si_factor
         self.info = ObjectInfo(
             name,
@@ -160,6 +165,7 @@ class _ObjectMessages:
             tuple(map(_parameter_info, model.study_parameters)),
             _scalar_info(self._field) if model.parameters else None,
             tuple(self._reactions.names),
+            tuple(InnerInfo(one.name, one.rest, one.triangles) for one in self._inner),
         )
 
     def message(self, result: FrameResult) -> ObjectMessage:
@@ -183,6 +189,7 @@ class _ObjectMessages:
                 )
                 for name, one in reactions.items()
             },
+            {} if found is None else {one.name: _inner_vertices(one, result, found) for one in self._inner},
         )
 
     def _surface(self, result: FrameResult, found: Estimate) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
@@ -198,6 +205,14 @@ class _ObjectMessages:
         if result.jumps and not self._covers_jumps:
             values = np.where(near_jumps(result.jumps, self._rest), np.nan, values)
         return vertices, values.astype(np.float32)
+
+
+def _inner_vertices(structure: CarriedStructure, result: FrameResult, found: Estimate) -> NDArray[np.float32]:
+    """Deformed vertices (p, 3) of a structure inside."""
+    vertices = structure.nodes(found.state.parameters)
+    if result.discrepancy is not None:
+        vertices = vertices + result.discrepancy.displacement(structure.rest)
+    return vertices.astype(np.float32)
 
 
 def _parameter_info(parameter: Parameter) -> ParameterInfo:

@@ -394,7 +394,7 @@ class _Job:
             return []
         objects = {
             part.name: StreamedObject(
-                part.model, name, _shown_of(part, self._run), part.options.modulus_std, view.surface_field
+                part.model, name, _shown_of(part, self._run), part.options.modulus_std, view.surface_field, part.inner
             )
             for part, name, view in zip(placed, self._run.stream_names, self._views, strict=True)
         }
