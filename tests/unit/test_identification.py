@@ -485,6 +485,26 @@ def test_a_run_that_ended_at_an_end_of_a_range_does_not_count(
     assert "note: what the run found for its whole sequence does not count: b at the end" in capsys.readouterr().out
 
 
+def test_a_run_whose_frames_contradict_each_other_does_not_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its last frames say c = 0.9; points measured otherwise 0.6."""
+    write_run_of_plate(tmp_path / "run", {"b": 0.5, "c": 0.9})
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    summary["one_over_the_sequence"][1]["is_one_value"] = False
+    (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
+    model, run = str(tmp_path / "run" / "model.morph"), str(tmp_path / "run")
+    command = ["identify", model, "--parameter", "c", "--run", run, "-o", str(tmp_path / "out")]
+    assert cli.main(command) == 2
+    assert "frames of the run contradict each other in c" in capsys.readouterr().err
+    rows = "".join(f"{i},1,{0.5 * i},0,0,,{lift_of(1.0, 0.6)},\n" for i in range(3))
+    (tmp_path / "points.csv").write_text("state,b_1,place_x_m,place_y_m,place_z_m,x_m,y_m,z_m\n" + rows)
+    assert cli.main([*command, "--points", str(tmp_path / "points.csv")]) == 0
+    said = capsys.readouterr().out
+    assert "does not count: frames contradict each other in c" in said
+    assert float(said.splitlines()[-1].split("c=")[1].split()[0]) == pytest.approx(0.6, abs=0.01)
+
+
 def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_model(tmp_path / "plate.morph", plate())
     places = np.linspace(0.0, 1.0, 9)

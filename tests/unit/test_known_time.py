@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 
 from morph_dslam.errors import TrackingError
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter
 from morph_dslam.tracking.combinations import check_options, check_times
-from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.known_values import KnownValues
 from morph_dslam.tracking.outcomes import TimeOutside
 from morph_dslam.tracking.run_options import TrackOptions
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA
 
+POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 SHEET = bent_sheet_model(22, 16)
 TIME = Parameter("hold", "time", "s", 0.0, 20.0, 0.0)
 MODEL = replace(SHEET, parameters=(SHEET.parameters[0], TIME, SHEET.parameters[2]))
@@ -72,3 +75,15 @@ def test_frames_without_times_and_rigs_are_refused():
     check_times(replace(run, time_zero=None), Numbered())
     with pytest.raises(TrackingError, match="leave out --time-zero or --with"):
         check_options(replace(run, other_cameras=(Path("g"),)))
+
+
+def test_a_time_that_is_known_is_at_no_bound():
+    """In the last frame of the range; a pull at the end of its own range is at the bound all the same."""
+    estimator, rng = Estimator(SHEET, CAMERA), np.random.default_rng(3)
+    upper = SHEET.upper.copy()
+    points, truth = bound_points(SHEET, 80, rng), State(np.array([upper[0], 0.0, upper[2]]), POSE)
+    pixels = CAMERA.project(points.in_camera(truth))
+    estimator.known.tell({"twist": upper[2]})
+    estimate = estimator.estimate(points, pixels, np.ones(len(points)), truth)
+    assert estimate.state.parameters == pytest.approx(truth.parameters, abs=1e-6)
+    assert estimate.at_bound.tolist() == [True, False, False]

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
 from morph_dslam.tracking.run_folder import largest_forces
@@ -23,3 +24,15 @@ def test_the_largest_force_is_that_which_is_largest_for_certain():
     assert (largest["frame"], largest["force_N"]) == (4, 3.0)
     del reactions["tip"][0], run.frames[0]
     assert largest_forces(run)[0]["frame"] == 5
+
+
+def test_no_force_at_all_is_as_uncertain_as_its_least_known_direction():
+    """A poke of 56 mN known to 49 mN, and frames in which nothing is found, to 252 mN in one direction."""
+    nothing = VectorEstimate.of(np.zeros(3), np.diag([0.01, 0.252, 0.05]) ** 2)
+    assert nothing.size_std == pytest.approx(0.252)
+    poke, none = VectorEstimate.of(np.array([0.0, 0.0, -0.056]), np.diag([0.01, 0.01, 0.049]) ** 2), np.zeros(3)
+    reactions = {"unknown loads": [Reaction(none, force, nothing) for force in (nothing, nothing, poke)]}
+    run = SimpleNamespace(model=stretched_block_model(), frames=[0, 1, 12], reactions=lambda: reactions)
+    (largest,) = largest_forces(run)
+    assert (largest["frame"], largest["force_N"]) == (12, pytest.approx(0.056))
+    assert largest["standard_deviation_N"] == pytest.approx(0.049)

@@ -21,7 +21,7 @@ from morph_dslam.tracking.observability import (
     value_line,
     von_mises_std,
 )
-from morph_dslam.tracking.outcomes import FoundBy, Status
+from morph_dslam.tracking.outcomes import FoundBy, PastForgotten, Status
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_folder import summarise
 from morph_dslam.tracking.run_notices import RunNotice, RunWarning, flags_of
@@ -55,8 +55,11 @@ def beam_model():
 MODEL = beam_model()
 
 
-def run_of(per_sequence, frames=3):
-    """A run in which 80 points with noise are seen in every frame."""
+def run_of(per_sequence, frames=3, later_shear=None, wider=1.0):
+    """A run in which 80 points with noise are seen in every frame.
+
+    From frame 6 on the shear may be another one; all deviations may be stated ``wider`` times.
+    """
     rng = np.random.default_rng(0)
     points, truth = bound_points(MODEL, 80, rng), State(np.array([0.3, 0.1, 0.2, 0.0]), POSE)
     estimator = Estimator(MODEL, CAMERA)
@@ -64,9 +67,12 @@ def run_of(per_sequence, frames=3):
     filtered = SequenceFilter(estimator, [names.index(name) for name in per_sequence])
     run = RunResults(MODEL, 0, per_sequence=per_sequence)
     for number in range(frames):
+        if number == 6 and later_shear is not None:
+            truth = State(np.array([0.3, 0.1, later_shear, 0.0]), POSE)
         pixels = CAMERA.project(points.in_camera(truth)) + 0.3 * rng.standard_normal((80, 2))
         seen = measured(points, pixels)
         estimate = filtered.fuse(seen, estimator.fit(seen, truth))
+        estimate = replace(estimate, covariance=wider**2 * estimate.covariance)
         times = dict.fromkeys(STAGES, 1.0)
         run.add(
             number,
@@ -76,6 +82,7 @@ def run_of(per_sequence, frames=3):
                 Status.TRACKED,
                 estimate,
                 FoundBy.FLOW,
+                warnings=(PastForgotten(),) if filtered.forgot else (),
                 n_points=80,
                 n_inliers=80,
                 residual_rms_px=0.4,
@@ -126,6 +133,25 @@ def test_values_over_the_sequence_have_an_interval_and_say_when_nothing_tells():
     assert any(notice["parameters"] == ["colour"] for notice in summary["notices"])
     assert value_line(shear).startswith("shear = 0.")
     assert value_line(colour).endswith("unobservable")
+
+
+def test_a_value_that_is_not_one_over_the_sequence_is_named():
+    """The shear is 0.2 in six frames and -0.4 in those that follow, of which the first two change nothing yet."""
+    summary = summarise(run_of(("shear", "colour"), frames=12, later_shear=-0.4))
+    (told,) = (notice for notice in summary["notices"] if notice["kind"] == "not_one_value")
+    assert (told["parameter"], told["last"], told["first"]) == ("shear", 5, 8)
+    before, after = (float(told[key].split(" ± ")[0]) for key in ("before", "after"))
+    assert (before, after) == (pytest.approx(0.2, abs=0.02), pytest.approx(-0.4, abs=0.02))
+    shear, colour = summary["one_over_the_sequence"]
+    assert (shear["is_one_value"], colour["is_one_value"]) == (False, True)
+    assert "last frames" in value_line(shear)
+
+
+@pytest.mark.parametrize(("later_shear", "wider"), [(None, 1.0), (0.2, 1.0), (-0.4, 60.0)])
+def test_frames_that_agree_within_their_deviations_are_not_accused(later_shear, wider):
+    summary = summarise(run_of(("shear",), frames=12, later_shear=later_shear, wider=wider))
+    assert [notice for notice in summary["notices"] if notice["kind"] == "not_one_value"] == []
+    assert summary["one_over_the_sequence"][0]["is_one_value"]
 
 
 def test_interval_is_in_the_parameters_unit():

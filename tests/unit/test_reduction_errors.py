@@ -38,6 +38,16 @@ def certified(model, errors, mean_mm=1e-6):
     return replace(model, certificate={"held_out": held_out})
 
 
+def without_rigid_motions(model):
+    """What each parameter moves the surface by, less its nearest rigid motion, by least squares."""
+    nodes = np.unique(model.triangles)
+    arms = model.nodes[nodes] - model.nodes[nodes].mean(axis=0)
+    rigid = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(nodes), 1)), np.cross(axis, arms))]
+    columns = np.array([np.ravel(part) for part in rigid]).T
+    by = [displacement(model, unit)[nodes].ravel() for unit in np.eye(2)]
+    return [part - columns @ np.linalg.lstsq(columns, part, rcond=None)[0] for part in by]
+
+
 @pytest.fixture(scope="module")
 def model():
     return stretched_block_model()
@@ -65,16 +75,21 @@ def test_what_a_constant_is_off_by_the_other_parameter_makes_good(model):
     found = errors.covariance(MIDDLE, np.array([False, True]))
     variance = np.mean(CHANGES[:, 1] ** 2)
     assert found[1, 1] == pytest.approx(variance, rel=1e-5)
-    nodes = np.unique(model.triangles)
-    arms = model.nodes[nodes] - model.nodes[nodes].mean(axis=0)
-    rigid = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(nodes), 1)), np.cross(axis, arms))]
-    columns = np.array([np.ravel(part) for part in rigid]).T
-    by = [displacement(model, unit)[nodes].ravel() for unit in np.eye(2)]
-    stretch, slide = (part - columns @ np.linalg.lstsq(columns, part, rcond=None)[0] for part in by)
+    stretch, slide = without_rigid_motions(model)
     taken = -(stretch @ slide) / (stretch @ stretch)
     assert found[0, 1] == pytest.approx(taken * variance, rel=1e-5, abs=1e-14)
     alone = np.mean([(stretch @ (a * stretch + b * slide) / (stretch @ stretch)) ** 2 for a, b in CHANGES])
     assert found[0, 0] == pytest.approx(alone + taken**2 * variance, rel=1e-5)
+
+
+@pytest.mark.parametrize("constant", [NEITHER, np.array([False, True])])
+def test_a_parameter_that_is_known_makes_no_error_good(model, constant):
+    """The slide takes what the stretch would have taken, as least squares of one unknown say."""
+    errors = errors_of(certified(model, [displacement(model, change) for change in CHANGES]))
+    found = errors.covariance(MIDDLE, constant, np.array([True, False]))
+    stretch, slide = without_rigid_motions(model)
+    alone = np.mean([(slide @ (a * stretch + b * slide) / (slide @ slide)) ** 2 for a, b in CHANGES])
+    assert found == pytest.approx(np.diag([0.0, alone]), rel=1e-5, abs=1e-16)
 
 
 def test_a_parameter_that_moves_the_surface_by_less_than_the_error_is_anywhere_in_its_range(model):

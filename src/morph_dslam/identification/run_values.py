@@ -31,10 +31,22 @@ def values_of_run(folder: Path, run: Run, names: Collection[str], measured: bool
     Raises
     ------
     IdentificationError
-        If nothing else was measured, and the run found a parameter at an end of its range.
+        If nothing else was measured, and the run found a parameter at an end of its range, or frames of it contradict
+        each other in one.
     """
     found = json.loads((folder / "summary.json").read_text())["one_over_the_sequence"]
     of_model = {parameter.name: parameter for parameter in run.model.parameters}
+    apart = [each["name"] for each in found if each["name"] in names and not each.get("is_one_value", True)]
+    if apart and not measured:
+        raise IdentificationError(
+            f"frames of the run contradict each other in {', '.join(apart)}, which is not one value there (see the "
+            "run's notes), and nothing else was measured: give points or forces, or track with a model that holds"
+        )
+    if apart:
+        return KnownValues.none(), [
+            f"note: what the run found for its whole sequence does not count: frames contradict each other in "
+            f"{', '.join(apart)}"
+        ]
     taken = [each for each in found if each["name"] in names and each["name"] in of_model and each["observable"]]
     ends = [text for each in found if taken and (text := _at_the_end(of_model.get(each["name"]), each["value"]))]
     if ends and not measured:

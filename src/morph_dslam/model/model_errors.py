@@ -45,6 +45,7 @@ class ModelErrors:
     n_loads : unknown loads among the last parameters; the reduction adds nothing to them.
     clocks : numbers of the parameters that may be the time.
     mesh_at_known_time : as ``mesh``, where the time is known.
+    has_time : whether the time is known, so that it makes no error good.
     """
 
     mesh: ParameterErrors | None
@@ -53,6 +54,7 @@ class ModelErrors:
     n_loads: int
     clocks: tuple[int, ...] = ()
     mesh_at_known_time: ParameterErrors | None = None
+    has_time: bool = False
 
     @classmethod
     def of(cls, model: ReducedModel, constant: Collection[str] = ()) -> ModelErrors | None:
@@ -66,7 +68,7 @@ class ModelErrors:
     def where_known(self, known: NDArray[np.int64]) -> ModelErrors:
         """The same where the parameters of these numbers (k,) are known, by a clock or by sensors."""
         has_time = len(self.clocks) == 1 and self.clocks[0] in known
-        return replace(self, mesh=self.mesh_at_known_time) if has_time else self
+        return replace(self, mesh=self.mesh_at_known_time, has_time=True) if has_time else self
 
     def at(self, mu: Array) -> ModelDeviation:
         """In the state ``mu`` (d,), SI."""
@@ -75,8 +77,9 @@ class ModelErrors:
             of_parameters, left = self.mesh.at(mu)
             covariance, squared = covariance + of_parameters, left**2
         if self.reduction is not None:
-            own = len(mu) - self.n_loads
-            covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own])
+            own, known = len(mu) - self.n_loads, np.zeros(len(mu), dtype=bool)
+            known[list(self.clocks)] = self.has_time
+            covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own], known[:own])
             squared += self.reduction.size_at(mu[:own]) ** 2
         return ModelDeviation(covariance, float(np.sqrt(squared)))
 

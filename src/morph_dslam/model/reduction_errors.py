@@ -78,7 +78,7 @@ class ReductionErrors:
         products = modes @ modes.T / (modes.shape[1] // 3)
         return cls(states, on_modes, sizes, model.upper - model.lower, model.displacement.functions, products)
 
-    def covariance(self, mu: Array, constant: NDArray[np.bool_]) -> Array:
+    def covariance(self, mu: Array, constant: NDArray[np.bool_], known: NDArray[np.bool_] | None = None) -> Array:
         """Covariance (d, d) of the parameters at a state, SI.
 
         With D the effects, e the error and r its size, the parameters are off by (D'D + r^2)^-1 D'e. What that leaves
@@ -90,9 +90,10 @@ class ReductionErrors:
         mu : (d,) the state, SI.
         constant : (d,) which parameters are found from many states together. Their errors are those at the held-out
             states, of which each counts by how well it shows the parameter.
+        known : (d,) which parameters are known exactly: they make no error good. None without any.
         """
-        effects = self._effects(mu)
-        free = np.flatnonzero(~constant)
+        effects, known = self._effects(mu), np.zeros(len(mu), dtype=bool) if known is None else known
+        constant, free = constant & ~known, np.flatnonzero(~constant & ~known)
         least = self._least(mu)
         inverse = self._inverse(effects[free], least)
         found = np.zeros((len(mu), len(mu)))
@@ -102,7 +103,7 @@ class ReductionErrors:
         # What a constant is off by, the others make good as far as they can.
         taken = np.eye(len(mu))[:, constant]
         taken[free] = -inverse @ effects[free] @ self.products @ effects[constant].T
-        found += taken * self._of_constants[constant] @ taken.T
+        found += taken * self._of_constants(known)[constant] @ taken.T
         return np.asarray(found * np.outer(self.ranges, self.ranges))
 
     def size_at(self, mu: Array) -> float:
@@ -130,13 +131,22 @@ class ReductionErrors:
         """Squared movement of the surface, square metres, below which the error hides a parameter."""
         return max(self.size_at(mu) ** 2, float(np.finfo(float).tiny))
 
+    def _of_constants(self, known: NDArray[np.bool_]) -> Array:
+        """Variances (d,) of parameters found from many states, over their ranges squared; 0 of those known (d,)."""
+        key, found = known.tobytes(), np.zeros(len(self.ranges))
+        if key not in self._variances:
+            sought = np.flatnonzero(~known)
+            totals, weights = np.zeros(len(sought)), np.zeros(len(sought))
+            for mu, on_modes in zip(self.states, self.on_modes, strict=True):
+                effects = self._effects(mu)[sought]
+                inverse = self._inverse(effects, self._least(mu))
+                shown = 1.0 / np.diag(inverse)
+                totals, weights = totals + shown * (inverse @ effects @ on_modes) ** 2, weights + shown
+            found[sought] = totals / weights
+            self._variances[key] = found
+        return self._variances[key]
+
     @cached_property
-    def _of_constants(self) -> Array:
-        """Variances (d,) of parameters found from many states, over their ranges squared."""
-        totals, weights = np.zeros(len(self.ranges)), np.zeros(len(self.ranges))
-        for mu, on_modes in zip(self.states, self.on_modes, strict=True):
-            effects = self._effects(mu)
-            inverse = self._inverse(effects, self._least(mu))
-            shown = 1.0 / np.diag(inverse)
-            totals, weights = totals + shown * (inverse @ effects @ on_modes) ** 2, weights + shown
-        return np.asarray(totals / weights, dtype=np.float64)
+    def _variances(self) -> dict[bytes, Array]:
+        """Those of `_of_constants` by what is known: they are asked for in every frame."""
+        return {}

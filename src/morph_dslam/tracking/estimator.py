@@ -166,7 +166,7 @@ class Estimate:
     residuals : (p, 2) projected minus measured, pixels.
     sigma_px : robust standard deviation of one pixel coordinate's residual.
     covariance : (d + 6, d + 6) of [parameters, rotation vector, translation]; infinite when undetermined.
-    at_bound : (d,) parameters that ended at a bound of the box.
+    at_bound : (d,) parameters that ended at a bound of the box, but for those that are known beforehand.
     iterations, converged : how the iteration ended.
     measured_covariance : the covariance without any prior on the parameters; None where there was none.
     stated_covariance : the covariance before the residuals widen it, by what they show that model and reference are off
@@ -374,4 +374,5 @@ class Estimator:
         )
         margin = BOUND_SHARE * (model.upper - model.lower)
         at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
+        at_bound[self.known.indices] = False  # they are where they are told to be
         return Estimate(state, found.cost, residuals, sigma, covariance, at_bound, found.iterations, found.converged)

@@ -21,6 +21,7 @@ from morph_dslam.tracking.outcomes import (
     ModelDoesNotExplain,
     ObjectMoved,
     OtherReferenceView,
+    PastForgotten,
     PoseSource,
     ReferenceWidened,
     Rejection,
@@ -138,7 +139,7 @@ def _with_systematic_errors(
     refuted = refuted_values(hypothesis, view.estimation, systematic, errors, doubt_px, whole)
     whole = whole and not len(view.estimation.known.indices)  # learned from the images alone then
     estimate = systematic.added(hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole, *known)
-    warnings: list[TrackingWarning] = [*refuted]
+    warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
     beyond = systematic.beyond_reference

@@ -39,6 +39,7 @@ from morph_dslam.tracking.outcomes import (
     FoundBy,
     ModelDoesNotExplain,
     ObjectMoved,
+    PastForgotten,
     PoseSource,
     Rejection,
     RejectionReason,
@@ -439,7 +440,7 @@ class RigTracker:
         recovered = all(result.recovered or result.estimate is None for result in results)
         found = replace(
             result,
-            warnings=(*warnings, *_not_explained(results, left)),
+            warnings=(*warnings, *([PastForgotten()] if self._filter.forgot else []), *_not_explained(results, left)),
             unexplained_px=max(rest.px for rest in left),
             status=Status.TRACKED,
             estimate=estimate,

@@ -122,8 +122,21 @@ def _change(parameter: Parameter, share: float) -> str:
     return f"'{parameter.name}' is {size:.3g}{unit} {'larger' if share > 0 else 'smaller'}"
 
 
-def one_value(parameter: Parameter, value: float, deviation: float) -> dict[str, object]:
-    """The figures of a parameter that is one over the sequence, in its own unit."""
+def with_deviation(parameter: Parameter, value: float, deviation: float) -> str:
+    """A value and its standard deviation, SI, in words, in the parameter's own unit."""
+    unit = "" if parameter.quantity == "ratio" else f" {parameter.unit}"
+    return f"{parameter.display(value):.4g} ± {parameter.display(deviation):.2g}{unit}"
+
+
+def one_value(parameter: Parameter, value: float, deviation: float, is_one_value: bool = True) -> dict[str, object]:
+    """The figures of a parameter that is one over the sequence, in its own unit.
+
+    Parameters
+    ----------
+    parameter : of the model.
+    value, deviation : after the last frame, SI.
+    is_one_value : whether no frames contradict each other in it.
+    """
     low, high = value - INTERVAL_95 * deviation, value + INTERVAL_95 * deviation
     width = parameter.upper - parameter.lower
     return {
@@ -132,6 +145,7 @@ def one_value(parameter: Parameter, value: float, deviation: float) -> dict[str,
         "value": parameter.display(value),
         "standard_deviation": parameter.display(deviation),
         "interval_95": [parameter.display(low), parameter.display(high)],
+        "is_one_value": is_one_value,
         "observable": bool(deviation < UNOBSERVABLE_SHARE * width),
         "at_bound": bool(min(value - parameter.lower, parameter.upper - value) < BOUND_SHARE * width),
     }
@@ -141,7 +155,10 @@ def value_line(figures: dict) -> str:
     """One line for the command line from `one_value`."""
     unit = "" if figures["unit"] == "1" else f" {figures['unit']}"
     low, high = figures["interval_95"]
-    text = f"{figures['name']} = {figures['value']:.4g}{unit} over the sequence"
+    text = f"{figures['name']} = {figures['value']:.4g}{unit}"
+    if not figures["is_one_value"]:
+        return f"{text} in the last frames, and something else before"
+    text += " over the sequence"
     if not figures["observable"]:
         return f"{text}, but it is unobservable"
     text += f", 95 % interval {low:.4g} to {high:.4g}{unit}"

@@ -207,6 +207,15 @@ class KnownRefuted(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class PastForgotten(TrackingWarning):
+    """Some frames in a row contradict all those before in what is one over the sequence: from here on they count."""
+
+    template: ClassVar[str] = (
+        "the last frames contradict those before in what is to be one value over the sequence: it is found anew"
+    )
+
+
+@dataclass(frozen=True)
 class TimeOutside(TrackingWarning):
     """A frame is before the instant at which the model's time begins, or after the end of its range: it is not known.
 

@@ -42,10 +42,14 @@ class VectorEstimate:
 
     @classmethod
     def of(cls, value: Array, covariance: Array) -> VectorEstimate:
-        """A vector (3,) whose components have a covariance (3, 3); deviations are infinite where that is not finite."""
+        """A vector (3,) whose components have a covariance (3, 3); deviations are infinite where that is not finite.
+
+        The deviation of the length is that along the vector; without any length, the largest in any direction.
+        """
         if not np.isfinite(covariance).all():
             return cls(value, np.full(3, np.inf), np.inf)
-        along = value / max(float(np.linalg.norm(value)), 1e-300)
+        size = float(np.linalg.norm(value))
+        along = value / size if size else np.linalg.eigh(covariance)[1][:, -1]
         variances = np.maximum([*np.diag(covariance), along @ covariance @ along], 0.0)
         return cls(value, np.sqrt(variances[:3]), float(np.sqrt(variances[3])))
 

@@ -30,6 +30,7 @@ from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.stated_errors import force_error, uncounted
 from morph_dslam.notices import Notice
+from morph_dslam.tracking.contradictions import contradictions
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
@@ -357,12 +358,16 @@ def _largest(
 
 
 def values_over_the_sequence(run: RunResults) -> list[dict[str, object]]:
-    """Value, standard deviation and 95 % interval of each parameter that is one over the sequence."""
+    """Value, standard deviation and 95 % interval of each parameter that is one over the sequence.
+
+    Where frames contradict each other in it, the value is that of the last frames.
+    """
+    apart = {one.parameter for one in contradictions(run)}
     last = next((r.estimate for r in reversed(run.results) if r.estimate), None)
     if last is None:
         return []
     return [
-        one_value(parameter, last.state.parameters[k], last.parameter_std[k])
+        one_value(parameter, last.state.parameters[k], last.parameter_std[k], k not in apart)
         for k, parameter in enumerate(run.model.study_parameters)
         if parameter.name in run.per_sequence
     ]

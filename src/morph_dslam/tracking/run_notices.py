@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words, unknown_mesh_error
 from morph_dslam.model.unknown_loads import supports_beside_loads
 from morph_dslam.notices import Notice
+from morph_dslam.tracking.contradictions import contradictions
 from morph_dslam.tracking.displacement_jumps import largest_jump
-from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run
+from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run, with_deviation
 from morph_dslam.tracking.outcomes import (
     CameraIgnored,
     CameraLost,
@@ -137,6 +138,11 @@ class RunWarning(StrEnum):
         "parameter '{parameter}' is at the {side} bound of its range ({bound}) in {count} {frames}: the object may be "
         "outside what the model covers; widen the range in the study and build again"
     )
+    NOT_ONE_VALUE = (
+        "'{parameter}' is not one value over the sequence: it is {before} up to frame {last}, and {after} from frame "
+        "{first} on; it changes (leave out --per-sequence), something acts that the study lacks, or the clock is off "
+        "(--fps, --time-zero)"
+    )
     UNOBSERVABLE = "{statement}"
     REREGISTERED = "registered anew in frame {frame}"
     NOT_REREGISTERED = "not registered anew in frame {frame}: {why}"
@@ -210,7 +216,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     mesh = unknown_mesh_error(run.model)
     if mesh is not None:
         found.append(of(RunWarning.MESH_ERROR_UNKNOWN, reason=mesh))
-    return [*found, *_unobservable(run, held)]
+    return [*found, *_not_one_value(run), *_unobservable(run, held)]
 
 
 def _of_frames(run: RunResults) -> list[RunNotice]:
@@ -331,6 +337,17 @@ def _at_bound(run: RunResults, held: NDArray[np.bool_]) -> list[RunNotice]:
                 found.append(
                     RunNotice.of(RunWarning.AT_BOUND, parameter=parameter.name, side=side, bound=shown, count=count)
                 )
+    return found
+
+
+def _not_one_value(run: RunResults) -> list[RunNotice]:
+    """Of which per-sequence parameters frames contradict each other."""
+    found = []
+    for one in contradictions(run):
+        parameter = run.model.study_parameters[one.parameter]
+        before, after = (with_deviation(parameter, *value) for value in (one.before, one.after))
+        data = {"parameter": parameter.name, "before": before, "after": after, "last": one.last, "first": one.first}
+        found.append(RunNotice.of(RunWarning.NOT_ONE_VALUE, **data))
     return found
 
 

@@ -227,6 +227,7 @@ class SequenceFilter(Generic[Frame]):
     ----------
     past_information : (d + 6, d + 6) with which the past counts in the last estimate, as a term of its cost
     keeps : whether the last estimate is the past of the next one
+    forgot : whether the last frame made it give up what the frames before say of parameters that are one per sequence
     """
 
     def __init__(
@@ -243,7 +244,7 @@ class SequenceFilter(Generic[Frame]):
         self._past: _Past | None = None
         self._unobservable = np.zeros((len(self._constant),) * 2)
         self._conflicts = 0
-        self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
+        self.past_information, self.keeps, self.forgot = np.zeros((self._unknowns,) * 2), True, False
 
     def change_points(self, change: PointChange) -> None:
         """Go on with the points of another view; what those so far have put into the past stays in it."""
@@ -259,7 +260,7 @@ class SequenceFilter(Generic[Frame]):
         alone : the estimate from the frame's measurements, and ``known``, only.
         known : what is known of the frame's pose or parameters from elsewhere, if anything.
         """
-        self.past_information, self.keeps = np.zeros((self._unknowns,) * 2), True
+        self.past_information, self.keeps, self.forgot = np.zeros((self._unknowns,) * 2), True, False
         linear = self._estimator.linear(measured, alone)
         self._noise.add(alone.residuals, measured, _taken(linear, alone.state, known))
         self._unobservable = self._without_effect(measured, linear, alone, known)
@@ -267,9 +268,10 @@ class SequenceFilter(Generic[Frame]):
         by_itself = self._with_covariance(alone, measured, linear, errors, known)
         if not len(self._kept):
             return by_itself
-        conflict = self._past is not None and self._contradicts(self._past, by_itself)
+        conflict = self._past is not None and self._contradicts(self._past, by_itself, len(self._kept))
         self._conflicts = self._conflicts + 1 if conflict else 0
-        if self._conflicts >= PATIENCE:
+        if self._past is not None and self._conflicts >= PATIENCE:
+            self.forgot = self._contradicts(self._past, by_itself, len(self._constant))
             self._past, self._conflicts = None, 0
         if self._past is None:
             self._keep(by_itself, errors)
@@ -409,10 +411,10 @@ class SequenceFilter(Generic[Frame]):
         """Projection (k, k) of shared parameters, as parts of their ranges, to what is unobservable in a frame."""
         return np.sqrt(12.0) * self._unobservable / self._ranges
 
-    def _contradicts(self, past: _Past, estimate: Estimate) -> bool:
-        """Whether a frame by itself says something else than all those before."""
-        apart = estimate.state.parameters[self._kept] - past.mean
-        spread = self._of_kept(estimate.covariance) + past.covariance
+    def _contradicts(self, past: _Past, estimate: Estimate, count: int) -> bool:
+        """Whether a frame by itself says something else than all those before of the first ``count`` that are kept."""
+        apart = (estimate.state.parameters[self._kept] - past.mean)[:count]
+        spread = (self._of_kept(estimate.covariance) + past.covariance)[:count, :count]
         return float(apart @ np.linalg.solve(spread, apart)) > GATE**2
 
     def _is_far_surer(self, past: _Past, estimate: Estimate) -> bool:
