@@ -41,9 +41,41 @@ def test_what_parameters_explain_of_an_error_is_found_and_the_rest_is_not(model)
     error = displacement(model, MEANT[0]) - displacement(model, STATES[0])
     # Motion along y is orthogonal to all that the parameters do.
     error[:, 1] += 1e-4
-    changes, left = equivalent_errors(model, STATES[0], error)
-    assert changes == pytest.approx(MEANT[0] - STATES[0], rel=1e-9)
-    assert left == pytest.approx(1e-4, rel=1e-9)
+    found = equivalent_errors(model, STATES[0], error)
+    assert found.changes == pytest.approx(MEANT[0] - STATES[0], rel=1e-9)
+    assert (found.left, found.in_object) == pytest.approx((1e-4, 1e-4), rel=1e-9)
+
+
+def test_a_free_pose_makes_good_what_is_rigid_and_the_displacement_is_off_by_it(model):
+    """The finer block is also turned by a milliradian, and shifted: the slide alone would take a part of that."""
+    mu, meant = STATES[0], MEANT[0]
+    surface = np.unique(model.triangles)
+    deformed = model.nodes + displacement(model, mu)
+    turned = np.cross([0.0, 1e-3, 0.0], deformed - deformed[surface].mean(axis=0)) + np.array([2e-5, -1e-5, 3e-5])
+    error = displacement(model, meant) - displacement(model, mu) + turned
+    found = equivalent_errors(model, mu, error, free_pose=True)
+    assert found.changes == pytest.approx(meant - mu, rel=1e-6)
+    assert found.left < 1e-9
+    assert found.in_object == pytest.approx(np.sqrt(np.mean(np.sum(turned[surface] ** 2, axis=1))), rel=1e-6)
+    assert abs(equivalent_errors(model, mu, error).changes[1] - (meant - mu)[1]) > 5e-6
+
+    entry = parameter_errors(model, [(mu, displacement(model, mu), displacement(model, mu) + error)])
+    errors = ModelErrors.of(replace(model, certificate={"discretisation": {"parameters": entry}}))
+    assert errors is not None
+    none, plain = np.empty(0, dtype=int), tracked_result(model, *mu)
+    by_pose = {free: with_model_errors(plain, errors.where_known(none, free)) for free in (False, True)}
+    for free, result in by_pose.items():
+        assert result.estimate is not None
+        assert result.estimate.by_model is not None
+        of_model = result.estimate.by_model
+        size, finer = (
+            np.sqrt(np.mean(np.sum(u[surface] ** 2, axis=1)))
+            for u in (deformed - model.nodes, deformed - model.nodes + error)
+        )
+        expected = found.in_object * size / finer if free else of_model.displacement
+        assert of_model.in_object == pytest.approx(expected, rel=1e-6)
+    off = by_pose[True].displacement_std()
+    assert off == pytest.approx(np.hypot(plain.displacement_std(), found.in_object * size / finer), rel=1e-5)
 
 
 def test_the_certificate_has_them_by_name_with_the_size_of_the_displacement(model, certified):

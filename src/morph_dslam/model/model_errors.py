@@ -7,7 +7,7 @@ and of the stresses and forces that follow from these. The displacement is off b
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,12 @@ class ModelDeviation:
     ----------
     parameters : (d, d) to the parameters' covariance, SI.
     displacement : to the displacement, root mean square length, metres.
+    in_object : to the displacement in the object's frame, where what the pose makes good is an error too.
     """
 
     parameters: Array
     displacement: float
+    in_object: float
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class ModelErrors:
     constant : (d,) which parameters are found from all frames together.
     n_loads : unknown loads among the last parameters; the reduction adds nothing to them.
     clocks : numbers of the parameters that may be the time.
-    mesh_at_known_time : as ``mesh``, where the time is known.
+    others : as ``mesh``, by whether the time is known and whether the pose is free.
     has_time : whether the time is known, so that it makes no error good.
     """
 
@@ -53,7 +55,7 @@ class ModelErrors:
     constant: NDArray[np.bool_]
     n_loads: int
     clocks: tuple[int, ...] = ()
-    mesh_at_known_time: ParameterErrors | None = None
+    others: dict[tuple[bool, bool], ParameterErrors | None] = field(default_factory=dict)
     has_time: bool = False
 
     @classmethod
@@ -63,25 +65,35 @@ class ModelErrors:
         if mesh is None and reduction is None:
             return None
         kept = np.array([parameter.name in constant for parameter in model.parameters], dtype=bool)
-        return cls(mesh, reduction, kept, model.n_loads, model.clocks, ParameterErrors.of(model, at_known_time=True))
+        others = {
+            (time, pose): ParameterErrors.of(model, time, pose) for time in (False, True) for pose in (False, True)
+        }
+        return cls(mesh, reduction, kept, model.n_loads, model.clocks, others)
 
-    def where_known(self, known: NDArray[np.int64]) -> ModelErrors:
-        """The same where the parameters of these numbers (k,) are known, by a clock or by sensors."""
+    def where_known(self, known: NDArray[np.int64], free_pose: bool = False) -> ModelErrors:
+        """The same where parameters are known and the pose is free, or not.
+
+        Parameters
+        ----------
+        known : (k,) numbers of the parameters that are, by a clock or by sensors.
+        free_pose : whether the images alone tell the pose.
+        """
         has_time = len(self.clocks) == 1 and self.clocks[0] in known
-        return replace(self, mesh=self.mesh_at_known_time, has_time=True) if has_time else self
+        return replace(self, mesh=self.others[has_time, free_pose], has_time=has_time)
 
     def at(self, mu: Array) -> ModelDeviation:
         """In the state ``mu`` (d,), SI."""
-        covariance, squared = np.zeros((len(mu), len(mu))), 0.0
+        covariance, squared, in_object = np.zeros((len(mu), len(mu))), 0.0, 0.0
         if self.mesh is not None:
-            of_parameters, left = self.mesh.at(mu)
-            covariance, squared = covariance + of_parameters, left**2
+            of_parameters, left, with_pose = self.mesh.at(mu)
+            covariance, squared, in_object = covariance + of_parameters, left**2, with_pose**2
         if self.reduction is not None:
             own, known = len(mu) - self.n_loads, np.zeros(len(mu), dtype=bool)
             known[list(self.clocks)] = self.has_time
             covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own], known[:own])
-            squared += self.reduction.size_at(mu[:own]) ** 2
-        return ModelDeviation(covariance, float(np.sqrt(squared)))
+            by_reduction = self.reduction.size_at(mu[:own]) ** 2
+            squared, in_object = squared + by_reduction, in_object + by_reduction
+        return ModelDeviation(covariance, float(np.sqrt(squared)), float(np.sqrt(in_object)))
 
     def in_common(self, mu: Array) -> tuple[Array, float]:
         """What is alike in all states: errors (d, k) of the parameters, SI, and of the displacement, as of `at`."""

@@ -197,8 +197,13 @@ class Estimate:
 
     @property
     def model_displacement(self) -> float:
-        """What the model's own errors add to the displacement, root mean square length, metres."""
+        """What the model's own errors add to positions in the camera frame, root mean square length, metres."""
         return 0.0 if self.by_model is None else self.by_model.displacement
+
+    @property
+    def model_displacement_in_object(self) -> float:
+        """What they add to the displacement in the object frame, where what the pose makes good is an error too."""
+        return 0.0 if self.by_model is None else self.by_model.in_object
 
     @property
     def parameter_std(self) -> Array:

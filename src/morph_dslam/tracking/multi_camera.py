@@ -449,7 +449,10 @@ class RigTracker:
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
         )
-        return with_model_errors(found, self._model_errors)
+        errors, nothing = self._model_errors, np.empty(0, dtype=np.int64)
+        if errors is not None:
+            errors = errors.where_known(nothing, found.pose_from.is_of_frame_alone)
+        return with_model_errors(found, errors)
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""

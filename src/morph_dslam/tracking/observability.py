@@ -179,7 +179,7 @@ def displacement_std(model: ReducedModel, estimate: Estimate) -> Array:
     """
     _, slopes = model.displacement.value_and_sensitivities(estimate.state.parameters)
     variances = _variances(slopes, estimate.image_covariance).sum(axis=1)
-    return np.sqrt(variances + estimate.model_displacement**2)
+    return np.sqrt(variances + estimate.model_displacement_in_object**2)
 
 
 def position_std(model: ReducedModel, estimate: Estimate) -> Array:
@@ -217,7 +217,7 @@ def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float
     direction = value[node] / max(float(length[node]), 1e-300)
     deviation = _deviation(model.displacement, node, direction, estimate.state, estimate.image_covariance)
     # In one direction of three.
-    return float(length[node]), float(np.hypot(deviation, estimate.model_displacement / np.sqrt(3.0)))
+    return float(length[node]), float(np.hypot(deviation, estimate.model_displacement_in_object / np.sqrt(3.0)))
 
 
 def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:

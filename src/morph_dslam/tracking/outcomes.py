@@ -43,6 +43,11 @@ class PoseSource(StrEnum):
     MAP = "map"
     NONE = ""
 
+    @property
+    def is_of_frame_alone(self) -> bool:
+        """Whether nothing but the frame's own picture tells the pose, which then makes good what is nearly rigid."""
+        return self in (PoseSource.POINTS, PoseSource.OUTLINE)
+
 
 class RejectionReason(StrEnum):
     """Why an estimate is not accepted; the texts are filled in by `Rejection`."""

@@ -64,7 +64,7 @@ class Surroundings:
             values = values + discrepancy.displacement(self.rest)
         d = len(slopes)
         covariance = estimate.image_covariance[:d, :d]
-        by_model = estimate.model_displacement**2 / (2.0 * self.gyration**2) * np.eye(3)
+        by_model = estimate.model_displacement_in_object**2 / (2.0 * self.gyration**2) * np.eye(3)
         found = []
         for rows in self.rows:
             rest = self.rest[rows]

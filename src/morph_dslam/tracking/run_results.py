@@ -163,7 +163,7 @@ class RunResults:
         if not np.isfinite(covariance).all():
             return [VectorEstimate.of(value, np.full((3, 3), np.inf)) for value in values]
         of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
-        of_points += estimate.model_displacement**2 / 3.0 * np.eye(3)
+        of_points += estimate.model_displacement_in_object**2 / 3.0 * np.eye(3)
         if discrepancy is not None:
             of_points += discrepancy.covariances(self.points.rest)
         return [VectorEstimate.of(value, of_point) for value, of_point in zip(values, of_points, strict=True)]

@@ -43,7 +43,7 @@ from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
+from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, RejectionReason, Status
 from morph_dslam.tracking.patches import LEVELS, follow, zero_where_unknown
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, first_view
 from morph_dslam.tracking.refinement import Keyframe
@@ -221,7 +221,7 @@ class Tracker:
             systematic, measured = self._view.systematic, self.estimator.known.indices
             held = None if systematic is None or not len(measured) else systematic.held(measured)
             change = self._choose_view(image, hypothesis, result)
-            result = with_model_errors(result, self._errors_now(), held)
+            result = with_model_errors(result, self._errors_now(result.pose_from), held)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
@@ -450,10 +450,10 @@ class Tracker:
             return None
         return systematic.deformation_errors(self._last, None if errors is None else errors.in_common)
 
-    def _errors_now(self) -> ModelErrors | None:
-        """Those of the model, by what is known in this frame."""
-        errors = self._model_errors
-        return None if errors is None else errors.where_known(self.estimator.known.indices)
+    def _errors_now(self, pose_from: PoseSource | None = None) -> ModelErrors | None:
+        """Those of the model, by what is known in this frame; where its pose is from counts if it is given."""
+        errors, free = self._model_errors, pose_from is not None and pose_from.is_of_frame_alone
+        return None if errors is None else errors.where_known(self.estimator.known.indices, free)
 
     @property
     def jumps(self) -> tuple[DisplacementJump, ...]:
