@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
 from morph_dslam.slam.camera_terms import CameraEstimate, CameraTerm, TermEstimate
 
 
-def camera_notes(estimate: CameraEstimate, deforms: bool = False) -> Iterator[str]:
+def camera_notes(
+    estimate: CameraEstimate, deforms: bool = False, refined: Collection[CameraTerm] = ()
+) -> Iterator[str]:
     """What a reader of a run must know of its camera, whose terms were all estimated.
 
-    ``deforms`` : whether it was estimated from an object whose deformation was estimated, too.
+    Parameters
+    ----------
+    estimate : of the camera
+    deforms : whether it was estimated from an object whose deformation was estimated, too
+    refined : terms that were estimated from the same recording before: they are not to be estimated once more
     """
-    wrong: list[CameraTerm] = [term for term, found in estimate.terms.items() if found.is_wrong and found.is_observable]
+    refuted: list[CameraTerm] = [
+        term for term, found in estimate.terms.items() if found.is_wrong and found.is_observable
+    ]
+    contradicted = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in refuted if term in refined]
+    if contradicted:
+        yield (
+            f"the recording contradicts itself about the camera: {'; '.join(contradicted)}, although --refine-camera "
+            "took the first value from it. Trust neither, and no lengths and angles of the map: calibrate the camera "
+            "with a board (morph calibrate)"
+        )
+    wrong: list[CameraTerm] = [term for term in refuted if term not in refined]
     named = [f"{_NAMES[term]} {_described(term, estimate.terms[term])}" for term in wrong if term != "readout"]
     if named:
         yield (

@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,10 @@ def run_slam(
                 }
             if isinstance(stream, LiveStream):
                 more["n_dropped"] = stream.dropped - n_before
-            summary = write_run(output, finish_scene(slam, frames, again), more, notes) if frames else {}
+            summary: dict[str, Any] = {}
+            if frames:
+                scene = replace(finish_scene(slam, frames, again), refined=tuple(refine))
+                summary = write_run(output, scene, more, notes)
     return summary
 
 

@@ -19,6 +19,7 @@ from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_doubts import camera_doubts
 from morph_dslam.io.colmap import ColmapModel
 from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.notices import Notice
 from morph_dslam.slam import rolling_shutter
 from morph_dslam.slam.bundle_adjustment import Observations, adjust
 from morph_dslam.slam.camera_notes import camera_notes, known_map_notes
@@ -41,6 +42,7 @@ from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
 from morph_dslam.slam.run_notes import run_notes, why_without_poses
+from morph_dslam.slam.scene_rigidity import motion_in_scene
 from morph_dslam.slam.second_pass import find_rest
 from morph_dslam.slam.self_calibration import estimate_camera
 from morph_dslam.slam.slam import Slam
@@ -73,6 +75,7 @@ class Scene:
     frames : what each frame gave, without its points; empty where the scene was loaded
     slam : what made the map, and finds the camera in further frames; None where the scene was loaded
     path : of the file that it was loaded from; None where it was just mapped
+    refined : terms of the camera that were estimated from the same recording before
     """
 
     camera: Camera
@@ -81,6 +84,7 @@ class Scene:
     frames: tuple[SlamFrame, ...] = ()
     slam: Slam | None = None
     path: Path | None = None
+    refined: tuple[CameraTerm, ...] = ()
 
     @cached_property
     def _estimates(self) -> dict[tuple[CameraTerm, ...], CameraEstimate | None]:
@@ -120,11 +124,27 @@ class Scene:
             self._estimates[key] = estimate_camera(self.map, self.camera, self.trajectory, seen, key)
         return self._estimates[key]
 
+    @cached_property
+    def notices(self) -> tuple[Notice, ...]:
+        """That the scene did not stay rigid, if its recording shows it; where the camera is estimated, too."""
+        estimate = self.camera_estimate()
+        if self.slam is None or estimate is None:
+            return ()
+        seen = _seen(self.slam, self.frames, self.trajectory)
+        found = motion_in_scene(self.map, self.camera, estimate.camera, self.trajectory, seen)
+        return () if found is None else (found,)
+
     @property
     def camera_notes(self) -> tuple[str, ...]:
-        """What is hardly right with the camera, and what the recording of the map shows of it, or does not show."""
+        """What is hardly right with the camera, and what the recording of the map shows of it, or does not show.
+
+        Where the scene did not stay rigid, that is said instead: its recording tells nothing of the camera.
+        """
         estimate = self.camera_estimate()
-        notes = tuple(camera_notes(estimate)) if estimate else self.map.camera_notes
+        if self.notices:
+            notes = tuple(notice.text for notice in self.notices)
+        else:
+            notes = tuple(camera_notes(estimate, refined=self.refined)) if estimate else self.map.camera_notes
         if self.slam is None:
             return notes
         if self.slam.knows_map and not len(self.trajectory):
@@ -372,7 +392,7 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
     times = np.array([frame.total_ms for frame in after] or [0.0])
     waits = np.array([frame.waited_ms for frame in after] or [0.0])
     errors = [frame.pose.rms_px for frame in found if frame.pose is not None]
-    estimate = scene.camera_estimate()
+    estimate = None if scene.notices else scene.camera_estimate()
     return {
         "n_frames": len(scene.frames),
         "start_frame": start,
@@ -391,6 +411,7 @@ def _summary_of_run(scene: Scene, slam: Slam) -> dict[str, Any]:
         "p99_wait_for_mapper_ms": float(np.percentile(waits, 99)),
         "settings": asdict(slam.options),
         "why_without_poses": why_without_poses(slam, scene.frames, after),
+        "notices": [notice.content() for notice in scene.notices],
         "flags": [*run_notes(slam, scene.frames, after), *scene.camera_notes],
     }
 

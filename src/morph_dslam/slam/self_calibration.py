@@ -7,6 +7,7 @@ Frames spread over the recording, and points that many of them see, are adjusted
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from morph_dslam.slam.camera_terms import (
     COLUMNS,
     MATTERS,
     N_UNKNOWNS,
+    TERMS,
     CameraEstimate,
     CameraTerm,
     TermEstimate,
@@ -47,6 +49,8 @@ LEAST_VIEWS, LEAST_SEEN, LEAST_CONNECTED = 3, 20, 0.8
 ROUNDS = 3
 #: Width of the Huber cost while poses and points are fitted to another camera.
 START_HUBER_PX = 20.0
+#: A round that lowers the cost by less than this part is the last one.
+LEAST_GAIN = 0.01
 
 
 class _Recording:
@@ -59,14 +63,15 @@ class _Recording:
         path: Trajectory,
         seen: Sequence[Followed],
         off: Sequence[OffByFactors] | None,
+        keyframes_only: bool = False,
     ) -> None:
-        self._camera, self._times, self._seen, self._off = camera, path.timestamps, seen, off
+        self._times, self._seen, self._off = path.timestamps, seen, off
         self._poses = path.camera_from_world.copy()
         self._positions = rigid_map.positions.copy()
         sees_enough = np.array([len(points.ids) >= LEAST_SEEN for points in seen])
         # What keyframes see was measured more exactly; without enough of them any frames have to do.
         exact = np.flatnonzero(sees_enough & np.isin(path.indices, list(rigid_map.seen_in_keyframes())))
-        rows = exact if len(exact) >= ENOUGH_KEYFRAMES else np.flatnonzero(sees_enough)
+        rows = exact if keyframes_only or len(exact) >= ENOUGH_KEYFRAMES else np.flatnonzero(sees_enough)
         self._rows, self._ids = self._chosen(rows, len(rigid_map.state))
         # Frames far apart have few points in common: then those in the middle of the recording have to do.
         while len(rows) > 2 * MOST_FRAMES and len(self._rows) < LEAST_CONNECTED * MOST_FRAMES:
@@ -89,9 +94,14 @@ class _Recording:
         return rows[n_seen >= LEAST_SEEN], ids
 
     @property
+    def has_points(self) -> bool:
+        """Whether there are enough points."""
+        return len(self._ids) >= LEAST_POINTS
+
+    @property
     def is_enough(self) -> bool:
         """Whether there are enough frames and points."""
-        return len(self._rows) >= LEAST_FRAMES and len(self._ids) >= LEAST_POINTS
+        return len(self._rows) >= LEAST_FRAMES and self.has_points
 
     def views(self) -> Views:
         """The chosen frames and points as they are now."""
@@ -164,6 +174,53 @@ def estimate_camera(
     except (np.linalg.LinAlgError, CameraError):
         return _as_before(camera, terms)  # what the frames have in common determines nothing, or no possible camera
     return _estimate(camera, solution, free, terms)
+
+
+@dataclass(frozen=True)
+class KeyframeFit:
+    """By how much the points of keyframes miss, once these, the points and the camera are adjusted together.
+
+    Attributes
+    ----------
+    pixels : (o, 2) where points were seen, as recorded
+    misses : (o, 2) pixels
+    frame_idx : (o,) in which of the keyframes
+    """
+
+    pixels: Array
+    misses: Array
+    frame_idx: Indices
+
+
+def fit_keyframes(
+    rigid_map: RigidMap, camera: Camera, estimated: Camera, path: Trajectory, seen: Sequence[Followed]
+) -> KeyframeFit | None:
+    """The keyframes of a map and a camera with all of its terms, adjusted together; None where points are few.
+
+    From a camera that is far off the way down the cost is long, and what is left on it looks like a scene that moves.
+
+    Parameters
+    ----------
+    rigid_map : made with ``camera``
+    camera : that the map was made with
+    estimated : to begin with
+    path : of the camera
+    seen : the map points in each of its frames
+    """
+    recording = _Recording(rigid_map, camera, path, seen, None, keyframes_only=True)
+    if not recording.has_points:
+        return None
+    free = np.array(sorted(column for term in terms_of(camera, TERMS) for column in COLUMNS[term]))
+    solution = solve(recording.views(), estimated, np.zeros(N_UNKNOWNS), free[:0], START_HUBER_PX)
+    before = np.inf
+    for _ in range(ROUNDS):
+        recording.take_over(solution.views, changed(estimated, solution.unknowns))
+        solution = solve(recording.views(), estimated, solution.unknowns, free)
+        if solution.cost > (1.0 - LEAST_GAIN) * before:
+            break
+        before = solution.cost
+    views = solution.views
+    return KeyframeFit(views.recorded, views.residuals(estimated, solution.unknowns), views.frame_idx)
 
 
 def _as_before(camera: Camera, terms: Sequence[CameraTerm]) -> CameraEstimate:
