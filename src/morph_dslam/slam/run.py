@@ -192,20 +192,22 @@ def _write_csv(path: Path, scene: Scene) -> None:
     header += ["position_std", "rotation_std_deg", "rms_px", "n_points", "n_candidates", "n_disagreeing"]
     header += ["is_keyframe", *(f"{stage}_ms" for stage in STAGES), "total_ms"]
     poses = dict(zip(scene.trajectory.indices.tolist(), scene.trajectory.world_from_camera, strict=True))
+    # In a map that follows what moves, residuals of a frame do not tell how far its pose is off.
+    unknown = bool(scene.notices)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         for frame in scene.frames:
             row: list[Any] = [frame.index, f"{frame.timestamp:.6f}", frame.status, frame.reason or ""]
-            row += _pose_columns(poses[frame.index], frame) if frame.index in poses else [""] * 10
+            row += _pose_columns(poses[frame.index], frame, unknown) if frame.index in poses else [""] * 10
             row += [frame.n_points, frame.n_candidates, frame.n_disagreeing]
             row += [int(frame.is_keyframe), *(f"{frame.timings_ms[s]:.3f}" for s in STAGES)]
             writer.writerow([*row, f"{frame.total_ms:.3f}"])
 
 
-def _pose_columns(world_from_camera: Array, frame: SlamFrame) -> list[str]:
+def _pose_columns(world_from_camera: Array, frame: SlamFrame, unknown: bool) -> list[str]:
     assert frame.pose is not None
-    variances = np.diag(frame.pose.covariance)
+    variances = np.full(6, np.inf) if unknown else np.diag(frame.pose.covariance)
     quaternion = Rotation.from_matrix(world_from_camera[:3, :3]).as_quat(canonical=True)
     deviations = [np.sqrt(variances[3:].sum()), np.degrees(np.sqrt(variances[:3].sum()))]
     return [

@@ -2,7 +2,8 @@
 
 Residuals of a rigid scene are errors of matching, of which neighbours in the picture share nothing. Where a part of the
 scene moves and the map follows it, the keyframes are a compromise, and neighbours miss to the same side. A wrong camera
-bends a map in this way too. So keyframes, points and camera are adjusted together first.
+bends a map in this way too. So keyframes, points and camera are adjusted together first, and what is left of lens and
+rolling shutter then, a smooth field over the picture, does not count.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from morph_dslam.threads import one_thread_for_algebra
 Array = NDArray[np.float64]
 #: Fewer keyframes say nothing of a scene.
 LEAST_KEYFRAMES = 5
-#: Neighbours of a point, and the multiple of the median miss from which on misses count linearly.
+#: Neighbours of a point, and the multiple of the median miss that longer ones count as.
 N_NEIGHBOURS, LONG_MISS = 6, 3.0
 #: The part of the keyframes that may be better than what is stated: what moves through a few of them only is outvoted
 #: in the others.
 BETTER_PART = 0.25
-#: Rendered and real rigid scenes, with right and wrong cameras, reach 0.1; maps that follow what moves begin at 0.3.
-MOST_CORRELATION = 0.22
+#: Rendered and real rigid scenes, with right and wrong cameras, reach 0.06; maps that follow what moves begin at 0.25.
+MOST_CORRELATION = 0.16
 #: Misses that neighbours share are no compromise below this, pixels: patches that overlap share errors of matching.
 LEAST_SHARED_PX = 0.01
 
@@ -44,7 +45,8 @@ class SceneNotRigid(Notice):
     ----------
     correlation : of the misses of neighbouring points; three quarters of the keyframes have a larger one. It is near
         0 in a rigid scene.
-    shared_px : root mean square of what neighbours miss by together, in the median keyframe, pixels
+    shared_px : root mean square of what neighbours miss by together, beside a smooth field, in the median keyframe,
+        pixels
     n_keyframes : that were compared
     """
 
@@ -82,7 +84,8 @@ def motion_in_scene(
 
 
 def _judged(fit: KeyframeFit) -> SceneNotRigid | None:
-    shared, total = neighbours_share(fit.pixels, fit.misses, fit.frame_idx)
+    misses = without_smooth_field(fit.pixels, fit.misses, fit.frame_idx)
+    shared, total = neighbours_share(fit.pixels, misses, fit.frame_idx)
     if len(total) < LEAST_KEYFRAMES:
         return None
     correlation = float(np.quantile(shared / total, BETTER_PART))
@@ -90,6 +93,32 @@ def _judged(fit: KeyframeFit) -> SceneNotRigid | None:
     if correlation < MOST_CORRELATION or shared_px < LEAST_SHARED_PX:
         return None
     return SceneNotRigid(correlation, shared_px, len(total))
+
+
+def without_smooth_field(pixels: Array, misses: Array, frame_idx: Indices) -> Array:
+    """Misses (o, 2) without the part that is a polynomial of second degree over the picture, frame by frame.
+
+    Parameters
+    ----------
+    pixels : (o, 2) where points were seen
+    misses : (o, 2) by how much, pixels
+    frame_idx : (o,) in which frame
+    """
+    rest = shortened(misses)
+    scaled = (pixels - pixels.mean(axis=0)) / max(float(pixels.std()), 1e-9)
+    x, y = scaled.T
+    terms = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    for frame in np.unique(frame_idx):
+        rows = frame_idx == frame
+        rest[rows] -= terms[rows] @ np.linalg.lstsq(terms[rows], rest[rows], rcond=None)[0]
+    return rest
+
+
+def shortened(misses: Array) -> Array:
+    """Misses (o, 2) of which the longest are as long as `LONG_MISS` medians: few must not decide."""
+    lengths = np.linalg.norm(misses, axis=1)
+    most = LONG_MISS * max(float(np.median(lengths)), 1e-9)
+    return misses * np.minimum(1.0, most / np.maximum(lengths, 1e-12))[:, None]
 
 
 def neighbours_share(pixels: Array, misses: Array, frame_idx: Indices) -> tuple[Array, Array]:
@@ -104,9 +133,6 @@ def neighbours_share(pixels: Array, misses: Array, frame_idx: Indices) -> tuple[
     misses : (o, 2) by how much, pixels
     frame_idx : (o,) in which frame
     """
-    lengths = np.linalg.norm(misses, axis=1)
-    most = LONG_MISS * max(float(np.median(lengths)), 1e-9)
-    misses = misses * np.minimum(1.0, most / np.maximum(lengths, 1e-12))[:, None]
     products, squares = list[float](), list[float]()
     for frame in np.unique(frame_idx):
         rows = np.flatnonzero(frame_idx == frame)
