@@ -31,7 +31,7 @@ N_NEIGHBOURS, LONG_MISS = 6, 3.0
 #: The part of the keyframes that may be better than what is stated: what moves through a few of them only is outvoted
 #: in the others.
 BETTER_PART = 0.25
-#: Rendered and real rigid scenes, with right and wrong cameras, reach 0.06; maps that follow what moves begin at 0.25.
+#: Rigid scenes, rendered and real, with right and wrong cameras, reach 0.06; maps that follow what moves, 0.2 to 0.5.
 MOST_CORRELATION = 0.16
 #: Misses that neighbours share are no compromise below this, pixels: patches that overlap share errors of matching.
 LEAST_SHARED_PX = 0.01
