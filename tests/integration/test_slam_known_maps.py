@@ -147,6 +147,21 @@ def test_a_lens_that_does_not_fit_the_recording_is_named_in_a_known_map(room, co
     assert right.summary()["flags"] == []
 
 
+def test_another_focal_length_than_the_maps_is_named(room, poses):
+    """A zoom is a homography of the picture, so that the second recording needs no other renderer."""
+    zoom = 1.1
+    of_zoomed = CAMERA.matrix.copy()
+    of_zoomed[:2, :2] *= zoom
+    pictures = [cv2.warpPerspective(image, of_zoomed @ np.linalg.inv(CAMERA.matrix), (640, 480)) for image in room[1]]
+    slam = start_slam(Film(room[1]), CAMERA, SlamOptions(), poses, Film(room[1]))
+    known = Scene(CAMERA, slam.map, NO_PATH)
+    (flag,) = map_scene(Film(pictures), CAMERA, known=known).summary()["flags"]
+    given, found, two_std = (float(number) for number in re.findall(r"\d+\.\d", flag)[:3])
+    assert given == CAMERA.fx
+    assert found == pytest.approx(zoom * CAMERA.fx, rel=0.02)
+    assert two_std < 0.04 * found
+
+
 def test_what_does_not_fit_is_refused(room, poses, colmap):
     late = Trajectory(poses.timestamps + 100.0, poses.world_from_camera)
     with pytest.raises(MapError, match=r"only 0 of 40 frames of film .* 0\.000 to 1\.300 s.* 100\.000 to 101\.300"):

@@ -205,7 +205,9 @@ def _check_camera(path: Path, file: h5py.File, camera: Camera) -> None:
     if size != (camera.width, camera.height) or not np.allclose(intrinsics, camera.intrinsics, rtol=1e-6):
         raise MapError(
             f"{path} was made with fx, fy, cx, cy = {', '.join(f'{x:.2f}' for x in intrinsics)} at "
-            f"{size[0]}x{size[1]} pixels: use the camera file it was made with"
+            f"{size[0]}x{size[1]} pixels: use the camera file it was made with, for pictures "
+            "that are of it. Resample those of another zoom, crop or camera to it (docs/slam.md), or map them by "
+            "themselves"
         )
     # Maps of earlier releases do not say with which they were made.
     readout_s = float(np.asarray(file.attrs.get("readout_s", camera.readout_s)))

@@ -34,6 +34,7 @@ from morph_dslam.slam.camera_terms import (
 )
 from morph_dslam.slam.depth_scale import check_depth_ratio
 from morph_dslam.slam.frame_images import least_distances, orientations
+from morph_dslam.slam.known_map_check import focal_note
 from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
 from morph_dslam.slam.options import SlamOptions
@@ -149,10 +150,20 @@ class Scene:
             return notes
         if self.slam.knows_map and not len(self.trajectory):
             notes = ()  # of another recording, and perhaps of another camera
-        elif self.slam.knows_map and (found := self._estimate(("radial",))) is not None:
-            notes = (*known_map_notes(found), *notes)
+        elif self.slam.knows_map:
+            notes = (*self._notes_in_known_map(self.slam), *notes)
         doubts = () if self.slam.frame_images.is_stereo else camera_doubts(self.camera)
         return tuple(dict.fromkeys((*doubts, *notes)))
+
+    def _notes_in_known_map(self, slam: Slam) -> Iterator[str]:
+        """What the recording shows of its camera, of which the map was made with another recording."""
+        lens, both = self._estimate(("radial",)), self._estimate(("focal", "radial"))
+        if lens is None or both is None:
+            return
+        yield from known_map_notes(lens)
+        seen = _seen(slam, self.frames, self.trajectory)
+        if (note := focal_note(both, self.map, self.camera, self.trajectory, seen)) is not None:
+            yield note
 
     def _median_depth(self) -> float | None:
         """Of the points in the views that the map keeps, along the optical axis; None without any."""
