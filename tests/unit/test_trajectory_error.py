@@ -239,6 +239,48 @@ def test_stamps_in_nanoseconds_are_not_called_numbers_of_frames():
         match(helix(), Trajectory(np.rint(1e9 * helix().timestamps), helix().world_from_camera))
 
 
+def numbered_run(folder, path, first=0):
+    """A run folder with the times of its frames, which are numbered from ``first``."""
+    folder.mkdir()
+    save_trajectory(folder / "trajectory.txt", path)
+    rows = [f"{first + row},{time:.6f},tracked" for row, time in enumerate(path.timestamps)]
+    (folder / "frames.csv").write_text("\n".join(["frame,timestamp_s,status", *rows, ""]))
+    return folder
+
+
+def write_numbered(path, poses, first=0):
+    """Poses as KITTI's file, and as COLMAP's of images that are numbered from ``first``."""
+    np.savetxt(path / "kitti.txt", poses[:, :3].reshape(len(poses), 12))
+    inverse = np.linalg.inv(poses)
+    quaternions = Rotation.from_matrix(inverse[:, :3, :3]).as_quat(scalar_first=True)
+    rows = np.column_stack([quaternions, inverse[:, :3, 3]])
+    lines = [f"{n + 1} {' '.join(map(str, row))} 1 {first + n:04d}.png\n" for n, row in enumerate(rows)]
+    (path / "images.txt").write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize(("name", "first"), [("kitti.txt", 0), ("images.txt", 0), ("images.txt", 7)])
+def test_a_truth_without_times_is_paired_by_frame_number(tmp_path, name, first):
+    truth = swaying()
+    write_numbered(tmp_path, truth.world_from_camera, first)
+    run = numbered_run(tmp_path / "run", Trajectory(np.arange(120) / 30.0, moved(truth, 4.0).world_from_camera), first)
+    figures = evaluate_trajectory(run, tmp_path / name)
+    assert figures["n_pairs"] == figures["n_poses"] == 120
+    assert figures["sim3"]["scale"] == pytest.approx(4.0)
+    assert figures["sim3"]["absolute_mm"]["rmse"] < 1e-3
+    assert not any("stamped" in note for note in figures["notes"])
+    (run / "frames.csv").unlink()
+    with pytest.raises(EvaluationError, match="the truth has frame numbers"):
+        evaluate_trajectory(run, tmp_path / name)
+
+
+def test_a_truth_of_other_frames_is_refused(tmp_path):
+    truth = swaying()
+    write_numbered(tmp_path, truth.world_from_camera)
+    run = numbered_run(tmp_path / "run", truth, first=500)
+    with pytest.raises(EvaluationError, match="the frames 0 to 119, and none of them"):
+        evaluate_trajectory(run, tmp_path / "kitti.txt")
+
+
 def test_published_figures_of_freiburg1_xyz():
     folder = real_data("trajectories")
     estimate, truth = match(

@@ -8,6 +8,7 @@ motion is.
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,8 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.points import MaterialError, millimetres
-from morph_dslam.evaluation.trajectory_notes import clock_advice, pair_notes, pose_notes, size_notes
+from morph_dslam.evaluation.trajectory_notes import check_numbers, clock_advice, pair_notes, pose_notes, size_notes
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
+from morph_dslam.io.text import read_text
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.io.writing import writing
 from morph_dslam.slam.map_files import has_known_scale
@@ -197,7 +199,7 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     ----------
     run : a run folder with ``trajectory.txt``, any trajectory file, or a trajectory in memory. If the map beside
         ``trajectory.txt`` has no known scale, ``se3`` is None.
-    truth : a trajectory or its file.
+    truth : a trajectory or its file. One that has frame numbers for times belongs to the frames of a run folder.
 
     Returns
     -------
@@ -206,7 +208,8 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     Raises
     ------
     EvaluationError
-        If the run has no trajectory, or it and the truth do not overlap in time.
+        If the run has no trajectory, or it and the truth do not overlap in time, or one has frame numbers
+        and the other seconds.
     TrajectoryError, MapError
         If one of them, or the run's map, cannot be read.
     """
@@ -216,7 +219,9 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
         path = _trajectory_file(Path(run))
         loaded = load_trajectory(path)
     whole = truth if isinstance(truth, Trajectory) else load_trajectory(Path(truth))
+    whole = _timed(whole, path)
     estimate, expected = match(loaded, whole)
+    check_numbers(len(estimate), loaded, whole)
     figures: dict[str, Any] = {
         "truth": None if isinstance(truth, Trajectory) else str(truth),
         "n_poses": len(loaded),
@@ -260,6 +265,30 @@ def _trajectory_file(path: Path) -> Path:
     if not path.is_file():
         raise EvaluationError(f"there is no trajectory {path}: give a run folder with one, or a trajectory file")
     return path
+
+
+def _timed(truth: Trajectory, path: Path | None) -> Trajectory:
+    """A truth that has frame numbers for times, stamped with the seconds that a run has for its frames.
+
+    Poses of frames that the run has not are left out. Without a run's table of frames nothing changes.
+    """
+    table = None if path is None else path.with_name("frames.csv")
+    if table is None or not truth.is_numbered or not table.is_file():
+        return truth
+    try:
+        rows = list(csv.DictReader(read_text(table, "table of frames", EvaluationError).splitlines()))
+        seconds = {float(row["frame"]): float(row["timestamp_s"]) for row in rows}
+    except (KeyError, TypeError, ValueError) as error:
+        raise EvaluationError(f"{table} does not say when frames were: give the run folder as it was made") from error
+    known = np.array([number in seconds for number in truth.timestamps.tolist()], dtype=bool)
+    if not known.any():
+        raise EvaluationError(
+            f"the truth has poses of the frames {truth.timestamps[0]:.0f} to {truth.timestamps[-1]:.0f}, and none of "
+            f"them is in {table}: give the truth of this recording"
+        )
+    times = np.array([seconds[number] for number in truth.timestamps[known].tolist()])
+    order = np.argsort(times, kind="stable")
+    return Trajectory(times[order], truth.world_from_camera[known][order])
 
 
 def _is_in_metres(path: Path) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from morph_dslam.errors import EvaluationError
 from morph_dslam.geometry import fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, other_conventions
 from morph_dslam.slam.run_notes import LONGEST_INTERVAL_S
@@ -174,8 +175,23 @@ def pair_notes(n_pairs: int, estimate: Trajectory, truth: Trajectory) -> Iterato
         )
 
 
+def check_numbers(n_pairs: int, estimate: Trajectory, truth: Trajectory) -> None:
+    """Refuse paths of which one has frame numbers, the other times, where few of these are alike by chance."""
+    if truth.is_numbered == estimate.is_numbered or n_pairs >= FEW_PAIRS * min(len(estimate), len(truth)):
+        return
+    raise EvaluationError(
+        f"only {n_pairs} of {len(estimate)} poses have a true one at their time: {clock_advice(estimate, truth)}"
+    )
+
+
 def clock_advice(estimate: Trajectory, truth: Trajectory) -> str:
     """What to do if few poses of the paths belong together in time."""
+    if truth.is_numbered != estimate.is_numbered:
+        numbered = "truth" if truth.is_numbered else "estimate"
+        return (
+            f"the {numbered} has frame numbers, as KITTI's and COLMAP's files do, and no times: compare it with a run "
+            "folder, whose frames.csv has both, or save it in TUM's format with times in seconds"
+        )
     whole = [bool((path.timestamps % 1.0 == 0.0).all()) for path in (estimate, truth)]
     if whole[0] != whole[1]:
         numbered, path = ("estimate", estimate) if whole[0] else ("truth", truth)

@@ -36,11 +36,13 @@ class Trajectory:
     timestamps : (n,) ascending, seconds; frame numbers where the file has no times
     world_from_camera : (n, 4, 4), translations in metres, or in the map's unit where it has no scale
     indices : (n,) frame numbers; 0, 1, ... where they are not known
+    is_numbered : whether the timestamps are frame numbers, of a file of a kind that has no times
     """
 
     timestamps: Array
     world_from_camera: Array
     indices: NDArray[np.int64] = None  # type: ignore[assignment]
+    is_numbered: bool = False
 
     def __post_init__(self) -> None:
         if self.indices is None:
@@ -83,10 +85,11 @@ def load_trajectory(path: Path) -> Trajectory:
         return _make(path, _seven_scenes_rows(path))
     lines = read_text(path, "trajectory", TrajectoryError).splitlines()
     if path.name == "images.txt" or any(line.startswith("# Image list") for line in lines[:5]):
-        return _make(path, _colmap_rows(path, lines))
+        return _make(path, _colmap_rows(path, lines), is_numbered=True)
     if lines and all(name in lines[0] for name in EUROC_COLUMNS):
         return _make(path, _euroc_rows(path, lines))
-    return _make(path, _table_rows(path, lines))
+    first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
+    return _make(path, _table_rows(path, lines), is_numbered=len(first.replace(",", " ").split()) == 12)
 
 
 def other_conventions(world_from_camera: Array) -> dict[str, Array]:
@@ -114,13 +117,13 @@ def save_trajectory(path: Path, trajectory: Trajectory) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def _make(path: Path, rows: Iterator[tuple[float, Array]]) -> Trajectory:
+def _make(path: Path, rows: Iterator[tuple[float, Array]], is_numbered: bool = False) -> Trajectory:
     """The trajectory of timed matrices (4, 4), in the order of time."""
     timed = sorted(rows, key=lambda row: row[0])
     if not timed:
         raise TrajectoryError(f"{path} holds no camera poses")
     timestamps, poses = zip(*timed, strict=True)
-    return Trajectory(np.array(timestamps), np.array(poses))
+    return Trajectory(np.array(timestamps), np.array(poses), is_numbered=is_numbered)
 
 
 def _table_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
