@@ -424,5 +424,31 @@ def test_euroc_gives_both_poses_in_the_body(tmp_path):
         with pytest.raises(CameraError, match=r"is a folder.*cam0/sensor.yaml: give a camera file"):
             load(tmp_path / "mav0" / "cam1")
     (tmp_path / "mav0" / "cam1" / "sensor.yaml").unlink()
-    with pytest.raises(CameraError, match=r"cannot read the camera file .*cam1"):
+    with pytest.raises(CameraError, match=r"no stereo pair: there is no .*cam1"):
         load_camera_or_pair(tmp_path)
+
+
+def test_opencvs_xml_is_named_with_what_to_save_instead(tmp_path):
+    files = {name: tmp_path / f"camera.{name}" for name in ("xml", "yaml")}
+    for path in files.values():
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        storage.write("image_width", 640)
+        storage.write("image_height", 480)
+        storage.write("camera_matrix", np.array([[528.0, 0, 320], [0, 527.5, 239.5], [0, 0, 1]]))
+        storage.release()
+    with pytest.raises(CameraError, match=r"is XML, which is not read .* ends with \.yaml"):
+        load_camera(files["xml"])
+    assert load_camera(files["yaml"]).intrinsics.tolist() == [528.0, 527.5, 320.0, 239.5]
+
+
+def test_a_euroc_folder_with_one_camera_is_no_pair_and_says_which_file_is_its_camera(tmp_path):
+    left = tmp_path / "mav0" / "cam0" / "sensor.yaml"
+    left.parent.mkdir(parents=True)
+    content = {"camera_model": "pinhole", "resolution": [640, 480], "intrinsics": [528.0, 527.5, 320.0, 239.5]}
+    left.write_text(yaml.safe_dump(content | {"T_BS": {"data": np.eye(4).ravel().tolist()}}))
+    with pytest.raises(CameraError, match=r"no stereo pair: .*for one camera give ") as error:
+        load_camera_or_pair(tmp_path)
+    named = str(error.value).rsplit(" ", 1)[1]
+    camera = load_camera_or_pair(named)
+    assert isinstance(camera, Camera)
+    assert camera.intrinsics.tolist() == [528.0, 527.5, 320.0, 239.5]

@@ -191,6 +191,11 @@ def _read_yaml(path: Path) -> object:
     Of several documents the first: `rostopic echo` writes the line that begins another one after each message.
     """
     lines = read_text(path, "camera file", CameraError).splitlines()
+    if lines and lines[0].lstrip().startswith("<?xml"):
+        raise CameraError(
+            f"{path} is XML, which is not read as a camera file: save it as YAML, with cv::FileStorage to a name that "
+            "ends with .yaml"
+        )
     if lines and lines[0].startswith("%YAML:"):
         # YAML writes this directive with a space, and a document that follows one begins with ---.
         lines = lines[1:]
@@ -249,6 +254,11 @@ def _euroc_base(folder: Path) -> Path:
 
 def _pair_of_euroc(folder: Path) -> StereoCamera:
     base = _euroc_base(folder)
+    if not (base / "cam1" / "sensor.yaml").is_file():
+        raise CameraError(
+            f"{folder} holds no stereo pair: there is no {base / 'cam1' / 'sensor.yaml'}; for one camera give "
+            f"{base / 'cam0' / 'sensor.yaml'}"
+        )
     cameras, poses = [], []
     for name in ("cam0", "cam1"):
         file = base / name / "sensor.yaml"
