@@ -162,8 +162,10 @@ def load_map_and_trajectory(path: Path, camera: Camera) -> tuple[RigidMap, Traje
     """
     with _opened(path) as file:
         none = Trajectory(np.empty(0), np.empty((0, 4, 4)))
-        path_of_run = [np.asarray(file[f"trajectory/{name}"]) for name in TRAJECTORY_ARRAYS if "trajectory" in file]
-        return _read(path, file, camera), Trajectory(*path_of_run) if path_of_run else none
+        if "trajectory" not in file:
+            return _read(path, file, camera), none
+        path_of_run = {name: np.asarray(file[f"trajectory/{name}"]) for name in TRAJECTORY_ARRAYS}
+        return _read(path, file, camera), replace(none, **path_of_run)
 
 
 def has_known_scale(path: Path) -> bool:
