@@ -114,7 +114,10 @@ def load_cameras(run: TrackOptions) -> tuple[RigCamera, ...]:
         )
     cameras, count = load_rig(Path(name)), 1 + len(run.other_cameras)
     if len(cameras) != count:
-        raise CameraError(f"{name} has {len(cameras)} cameras, but there are {count} recordings")
+        raise CameraError(
+            f"{name} has {len(cameras)} cameras, but there are {count} recordings: name one of each camera in their "
+            "order, or leave a camera out of a copy of the file, whose T_cn_cnm1 are relative to the camera before"
+        )
     recordings = [str(recording) for recording in (run.frames, *run.other_cameras)]
     twice = [recording for recording in set(recordings) if recordings.count(recording) > 1]
     if twice:
