@@ -31,6 +31,7 @@ from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import STAGES, SlamFrame
 from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camera, start_slam, track_frames
+from morph_dslam.slam.scene_rigidity import SceneNotRigid
 from morph_dslam.sources import FrameSource, open_source, open_stream
 from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream
@@ -193,7 +194,7 @@ def _write_csv(path: Path, scene: Scene) -> None:
     header += ["is_keyframe", *(f"{stage}_ms" for stage in STAGES), "total_ms"]
     poses = dict(zip(scene.trajectory.indices.tolist(), scene.trajectory.world_from_camera, strict=True))
     # In a map that follows what moves, residuals of a frame do not tell how far its pose is off.
-    unknown = bool(scene.notices)
+    unknown = any(isinstance(notice, SceneNotRigid) for notice in scene.notices)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)

@@ -37,6 +37,7 @@ from morph_dslam.slam.frame_images import least_distances, orientations
 from morph_dslam.slam.known_map_check import focal_note
 from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
+from morph_dslam.slam.moved_part import moved_part
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.relocalization import bit_counts
@@ -127,8 +128,14 @@ class Scene:
 
     @cached_property
     def notices(self) -> tuple[Notice, ...]:
-        """That the scene did not stay rigid, if its recording shows it; where the camera is estimated, too."""
-        estimate = self.camera_estimate()
+        """That the scene did not stay rigid, or a part of a known map was moved, if the recording shows it."""
+        estimate, slam = self.camera_estimate(), self.slam
+        if slam is not None and slam.knows_map:
+            # Another lens or zoom puts points of a part of the picture elsewhere, too.
+            if any(self._notes_in_known_map(slam)):
+                return ()
+            part = moved_part(self.map, self.camera, self.trajectory, slam.seen_in_known_map, slam.astray_in_known_map)
+            return () if part is None else (part,)
         if self.slam is None or estimate is None:
             return ()
         seen = _seen(self.slam, self.frames, self.trajectory)
@@ -141,15 +148,15 @@ class Scene:
 
         Where the scene did not stay rigid, that is said instead: its recording tells nothing of the camera.
         """
-        estimate = self.camera_estimate()
-        if self.notices:
-            notes = tuple(notice.text for notice in self.notices)
+        estimate, found = self.camera_estimate(), tuple(notice.text for notice in self.notices)
+        if estimate is None:
+            notes = (*found, *self.map.camera_notes)
         else:
-            notes = tuple(camera_notes(estimate, refined=self.refined)) if estimate else self.map.camera_notes
+            notes = found or tuple(camera_notes(estimate, refined=self.refined))
         if self.slam is None:
             return notes
         if self.slam.knows_map and not len(self.trajectory):
-            notes = ()  # of another recording, and perhaps of another camera
+            notes = found  # others are of another recording, and perhaps of another camera
         elif self.slam.knows_map:
             notes = (*self._notes_in_known_map(self.slam), *notes)
         doubts = () if self.slam.frame_images.is_stereo else camera_doubts(self.camera)

@@ -65,6 +65,7 @@ class Slam:
     depth_ratio : measured depths over those of a map that was known before, once a frame told; None before
     seen_in_known_map : points of the first frames in a map that was known before and is kept, by the frames' numbers:
         records of such frames have none, and the lens is checked by them
+    astray_in_known_map : the points of these frames that disagree with a rigid scene
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Slam:
         self.n_known, self.n_depths_aside = 0, 0
         self.depth_ratio: float | None = None
         self.seen_in_known_map: dict[int, Followed] = {}
+        self.astray_in_known_map: dict[int, Followed] = {}
         self._expects_depth = with_depth or self.frame_images.is_stereo or not self.options.use_depth
         self._begin(RigidMap(self.frame_images.baseline_px))
 
@@ -130,7 +132,7 @@ class Slam:
 
     def _begin(self, rigid_map: RigidMap) -> None:
         self.map, k = rigid_map, self.camera.intrinsics
-        self.seen_in_known_map = {}  # of another map, their points are others
+        self.seen_in_known_map, self.astray_in_known_map = {}, {}  # of another map, their points are others
         self._initializer = MapInitializer(k)
         self._tracker = Tracker(self.map, self.camera)
         self._making = MapMaking(self.map, self.camera, self._tracker, self.threaded)
@@ -174,6 +176,7 @@ class Slam:
                 self.depth_ratio = self._compared_depth(view, frame)
             if self.knows_map and self.is_frozen and len(self.seen_in_known_map) < MOST_FRAMES_SEEN:
                 self.seen_in_known_map[index] = frame.points.without_unmeasured()
+                self.astray_in_known_map[index] = frame.disagreeing.without_unmeasured()
             if not self.is_frozen:
                 self._making.end_frame()
             self._n_lost = self._n_lost + 1 if frame.status is SlamStatus.LOST else 0
