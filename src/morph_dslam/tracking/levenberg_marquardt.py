@@ -23,8 +23,9 @@ Array = NDArray[np.float64]
 def bounded_step(hessian, gradient, lower, upper):
     """Minimiser of the quadratic model between bounds, by a primal active set.
 
-    From no step it moves towards the minimiser of the unknowns that are free, up to the first bound on the way, which
-    is then held; at that minimiser the held unknown that gains most by leaving its bound is freed.
+    It begins with all unknowns held that leave their bounds at once, which mostly are those that matter. From there it
+    moves towards the minimiser of the unknowns that are free, up to the first bound on the way, which is then held; at
+    that minimiser the held unknown that gains most by leaving its bound is freed.
 
     Parameters
     ----------
@@ -40,21 +41,15 @@ def bounded_step(hessian, gradient, lower, upper):
     free = np.ones(n, dtype=np.bool_)
     for k in range(n):
         free[k] = not ((lower[k] == 0.0 and gradient[k] > 0.0) or (upper[k] == 0.0 and gradient[k] < 0.0))
-    # Each bound is met and left a few times at most: the limit only guards against rounding.
-    for _ in range(4 * n + 4):
-        target = _minimiser_of_free(hessian, gradient, step, free)
-        share, first = 1.0, -1
+    leaves = True
+    while leaves:
+        target, leaves = _minimiser_of_free(hessian, gradient, step, free), False
         for k in range(n):
-            bound = lower[k] if target[k] < lower[k] else upper[k]
-            if target[k] < lower[k] or target[k] > upper[k]:
-                part = (bound - step[k]) / (target[k] - step[k])
-                if part < share:
-                    share, first = part, k
-        step += share * (target - step)
-        if first >= 0:
-            step[first] = lower[first] if target[first] < lower[first] else upper[first]
-            free[first] = False
-            continue
+            step[k] = min(max(target[k], lower[k]), upper[k])
+            if step[k] != target[k]:
+                free[k], leaves = False, True
+    # Each bound is left a few times at most: the limit only guards against rounding.
+    for _ in range(4 * n + 4):
         slope = gradient + hessian @ step
         gain, best = 1e-14 * abs(gradient @ step), -1
         for k in range(n):
@@ -64,6 +59,21 @@ def bounded_step(hessian, gradient, lower, upper):
         if best < 0:
             break
         free[best] = True
+        first = 0
+        while first >= 0:
+            target = _minimiser_of_free(hessian, gradient, step, free)
+            share, first = 1.0, -1
+            for k in range(n):
+                bound = lower[k] if target[k] < lower[k] else upper[k]
+                if target[k] < lower[k] or target[k] > upper[k]:
+                    part = (bound - step[k]) / (target[k] - step[k])
+                    if part < share:
+                        share, first = part, k
+            for k in range(n):  # rounding may leave it an ulp outside
+                step[k] = min(max(step[k] + share * (target[k] - step[k]), lower[k]), upper[k])
+            if first >= 0:
+                step[first] = lower[first] if target[first] < lower[first] else upper[first]
+                free[first] = False
     return step
 
 
