@@ -471,16 +471,21 @@ def test_the_unknown_correlation_of_a_runs_values_narrows_nothing(tmp_path: Path
     assert (b["standard_deviation"], c["standard_deviation"]) == pytest.approx((0.0141421, 0.0141421), rel=1e-3)
 
 
+def identification_of_c(folder: Path, found: dict[str, float]) -> list[str]:
+    """A command that identifies c by a run that found these values; and ``points.csv``, measured with c = 0.6."""
+    write_run_of_plate(folder / "run", found)
+    rows = "".join(f"{i},1,{0.5 * i},0,0,,{lift_of(1.0, 0.6)},\n" for i in range(3))
+    (folder / "points.csv").write_text("state,b_1,place_x_m,place_y_m,place_z_m,x_m,y_m,z_m\n" + rows)
+    model, run = str(folder / "run" / "model.morph"), str(folder / "run")
+    return ["identify", model, "--parameter", "c", "--run", run, "-o", str(folder / "out")]
+
+
 def test_a_run_that_ended_at_an_end_of_a_range_does_not_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_run_of_plate(tmp_path / "run", {"b": 1.0, "c": 0.7})
-    model, run = str(tmp_path / "run" / "model.morph"), str(tmp_path / "run")
-    command = ["identify", model, "--parameter", "c", "--run", run, "-o", str(tmp_path / "out")]
+    command = identification_of_c(tmp_path, {"b": 1.0, "c": 0.7})
     assert cli.main(command) == 2
     assert "the run found b at the end of its range, 1, where its deviations do not hold" in capsys.readouterr().err
-    rows = "".join(f"{i},1,{0.5 * i},0,0,,{lift_of(1.0, 0.6)},\n" for i in range(3))
-    (tmp_path / "points.csv").write_text("state,b_1,place_x_m,place_y_m,place_z_m,x_m,y_m,z_m\n" + rows)
     assert cli.main([*command, "--points", str(tmp_path / "points.csv")]) == 0
     assert "note: what the run found for its whole sequence does not count: b at the end" in capsys.readouterr().out
 
@@ -489,16 +494,12 @@ def test_a_run_whose_frames_contradict_each_other_does_not_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its last frames say c = 0.9; points measured otherwise 0.6."""
-    write_run_of_plate(tmp_path / "run", {"b": 0.5, "c": 0.9})
+    command = identification_of_c(tmp_path, {"b": 0.5, "c": 0.9})
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     summary["one_over_the_sequence"][1]["is_one_value"] = False
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
-    model, run = str(tmp_path / "run" / "model.morph"), str(tmp_path / "run")
-    command = ["identify", model, "--parameter", "c", "--run", run, "-o", str(tmp_path / "out")]
     assert cli.main(command) == 2
     assert "frames of the run contradict each other in c" in capsys.readouterr().err
-    rows = "".join(f"{i},1,{0.5 * i},0,0,,{lift_of(1.0, 0.6)},\n" for i in range(3))
-    (tmp_path / "points.csv").write_text("state,b_1,place_x_m,place_y_m,place_z_m,x_m,y_m,z_m\n" + rows)
     assert cli.main([*command, "--points", str(tmp_path / "points.csv")]) == 0
     said = capsys.readouterr().out
     assert "does not count: frames contradict each other in c" in said

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.errors import ModelFileError, refusal
 from morph_dslam.io.hdf5_writing import written_hdf5
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.field_storage import read_array, read_text
 from morph_dslam.model.reduced_model import MaterialPoints, ReducedModel
 from morph_dslam.model.separated import SeparatedField
@@ -52,9 +53,10 @@ class CarriedStructure:
     rest: Array
     field: SeparatedField
 
-    def nodes(self, mu: ArrayLike) -> Array:
-        """Deformed nodes (p, 3) in the object frame, metres."""
-        return self.rest + self.field.value(mu)
+    def nodes(self, mu: ArrayLike, beyond: Discrepancy | None = None) -> Array:
+        """Deformed nodes (p, 3) in the object frame, metres, with what the shape has beyond the model's."""
+        nodes = self.rest + self.field.value(mu)
+        return nodes if beyond is None else nodes + beyond.displacement(self.rest)
 
     def centre_and_sensitivities(self, mu: ArrayLike) -> tuple[Array, Array]:
         """Mean of the deformed nodes (3,) in the object frame, metres, and its derivatives (d, 3)."""

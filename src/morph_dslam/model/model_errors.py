@@ -65,8 +65,11 @@ class ModelErrors:
         if mesh is None and reduction is None:
             return None
         kept = np.array([parameter.name in constant for parameter in model.parameters], dtype=bool)
+        products = None if mesh is None else mesh.products
         others = {
-            (time, pose): ParameterErrors.of(model, time, pose) for time in (False, True) for pose in (False, True)
+            (time, pose): ParameterErrors.of(model, time, pose, products)
+            for time in (False, True)
+            for pose in (False, True)
         }
         return cls(mesh, reduction, kept, model.n_loads, model.clocks, others)
 

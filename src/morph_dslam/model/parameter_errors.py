@@ -145,6 +145,11 @@ def surface_modes(model: ReducedModel) -> Array:
     return field.modes[:, nodes].reshape(field.n_modes, -1).astype(np.float64)
 
 
+def mean_products(modes: Array) -> Array:
+    """Mean products (m, m) of modes (m, 3 s) over s nodes, squared metres."""
+    return np.asarray(modes @ modes.T / (modes.shape[1] // 3), dtype=np.float64)
+
+
 def _rms(displacement: Array) -> float:
     """Root mean square length of vectors (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(displacement**2, axis=1))))
@@ -172,8 +177,13 @@ class ParameterErrors:
     n_loads: int = 0
 
     @classmethod
-    def of(cls, model: ReducedModel, at_known_time: bool = False, free_pose: bool = False) -> ParameterErrors | None:
-        """Those of a model, perhaps where its time is known or the pose free; None where its certificate has none."""
+    def of(
+        cls, model: ReducedModel, at_known_time: bool = False, free_pose: bool = False, products: Array | None = None
+    ) -> ParameterErrors | None:
+        """Those of a model, perhaps where its time is known or the pose free; None where its certificate has none.
+
+        ``products`` : as of another case of the same model; None to compute them.
+        """
         stated = model.certificate.get("discretisation", {}).get(ENTRY)
         if stated is None or not model.parameters:
             return None
@@ -187,9 +197,9 @@ class ParameterErrors:
         moved = sizes > 0.0
         if not moved.any():
             return None
-        modes = surface_modes(model)
+        products = mean_products(surface_modes(model)) if products is None else products
         shares = [float(np.sqrt(np.mean((part[moved] / sizes[moved]) ** 2))) for part in (left, in_object)]
-        products, functions = modes @ modes.T / (modes.shape[1] // 3), model.displacement.functions
+        functions = model.displacement.functions
         return cls(errors[moved] / sizes[moved, None], shares[0], shares[1], functions, products, model.n_loads)
 
     def at(self, mu: Array) -> tuple[Array, float, float]:

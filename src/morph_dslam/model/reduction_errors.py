@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.functions import Functions
-from morph_dslam.model.parameter_errors import surface_modes
+from morph_dslam.model.parameter_errors import mean_products, surface_modes
 from morph_dslam.model.reduced_model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -73,9 +73,8 @@ class ReductionErrors:
         wanted = (len(states), model.displacement.n_modes), (len(on_modes), len(model.parameters))
         if not len(states) or not len(model.parameters) or (on_modes.shape, states.shape) != wanted:
             return None
-        modes = _deforming_modes(model)
+        products = mean_products(_deforming_modes(model))
         sizes = 1e-3 * np.array(stated["mean_mm"], dtype=np.float64)
-        products = modes @ modes.T / (modes.shape[1] // 3)
         return cls(states, on_modes, sizes, model.upper - model.lower, model.displacement.functions, products)
 
     def covariance(self, mu: Array, constant: NDArray[np.bool_], known: NDArray[np.bool_] | None = None) -> Array:

@@ -132,7 +132,7 @@ class Scene:
         estimate, slam = self.camera_estimate(), self.slam
         if slam is not None and slam.knows_map:
             # Another lens or zoom puts points of a part of the picture elsewhere, too.
-            if any(self._notes_in_known_map(slam)):
+            if self._notes_in_known_map:
                 return ()
             part = moved_part(self.map, self.camera, self.trajectory, slam.seen_in_known_map, slam.astray_in_known_map)
             return () if part is None else (part,)
@@ -158,19 +158,19 @@ class Scene:
         if self.slam.knows_map and not len(self.trajectory):
             notes = found  # others are of another recording, and perhaps of another camera
         elif self.slam.knows_map:
-            notes = (*self._notes_in_known_map(self.slam), *notes)
+            notes = (*self._notes_in_known_map, *notes)
         doubts = () if self.slam.frame_images.is_stereo else camera_doubts(self.camera)
         return tuple(dict.fromkeys((*doubts, *notes)))
 
-    def _notes_in_known_map(self, slam: Slam) -> Iterator[str]:
+    @cached_property
+    def _notes_in_known_map(self) -> tuple[str, ...]:
         """What the recording shows of its camera, of which the map was made with another recording."""
         lens, both = self._estimate(("radial",)), self._estimate(("focal", "radial"))
-        if lens is None or both is None:
-            return
-        yield from known_map_notes(lens)
-        seen = _seen(slam, self.frames, self.trajectory)
-        if (note := focal_note(both, self.map, self.camera, self.trajectory, seen)) is not None:
-            yield note
+        if self.slam is None or lens is None or both is None:
+            return ()
+        seen = _seen(self.slam, self.frames, self.trajectory)
+        note = focal_note(both, self.map, self.camera, self.trajectory, seen)
+        return (*known_map_notes(lens), *(() if note is None else (note,)))
 
     def _median_depth(self) -> float | None:
         """Of the points in the views that the map keeps, along the optical axis; None without any."""

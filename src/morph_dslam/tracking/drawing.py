@@ -305,10 +305,7 @@ class AugmentedView:
         if self._edges is not None:
             _draw_edges(drawn, self._edges, state.camera_from_object, self._camera)
         for number, structure in enumerate(self._inner):
-            nodes = structure.nodes(state.parameters)
-            if discrepancy is not None:
-                nodes = nodes + discrepancy.displacement(structure.rest)
-            nodes = state.camera_from_object.apply(nodes)
+            nodes = state.camera_from_object.apply(structure.nodes(state.parameters, discrepancy))
             red, green, blue = colour_of(number)
             drawn = draw_inner_surface(
                 drawn,

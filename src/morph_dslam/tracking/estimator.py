@@ -379,5 +379,5 @@ class Estimator:
         )
         margin = BOUND_SHARE * (model.upper - model.lower)
         at_bound = (state.parameters < model.lower + margin) | (state.parameters > model.upper - margin)
-        at_bound[self.known.indices] = False  # they are where they are told to be
+        at_bound[self.known.indices] = False  # a sensor or a clock says where they are
         return Estimate(state, found.cost, residuals, sigma, covariance, at_bound, found.iterations, found.converged)

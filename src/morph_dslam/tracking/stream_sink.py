@@ -172,7 +172,10 @@ class _ObjectMessages:
         """The object in a frame."""
         found = result.estimate
         vertices, scalar = (None, None) if found is None else self._surface(result, found)
-        reactions = {} if found is None else self._reactions(found, self._modulus_std)
+        reactions, inside = {}, dict[str, NDArray[np.float32]]()
+        if found is not None:
+            reactions, mu = self._reactions(found, self._modulus_std), found.state.parameters
+            inside = {one.name: one.nodes(mu, result.discrepancy).astype(np.float32) for one in self._inner}
         return ObjectMessage(
             self.info.name,
             result.status.value,
@@ -189,7 +192,7 @@ class _ObjectMessages:
                 )
                 for name, one in reactions.items()
             },
-            {} if found is None else {one.name: _inner_vertices(one, result, found) for one in self._inner},
+            inside,
         )
 
     def _surface(self, result: FrameResult, found: Estimate) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
@@ -205,14 +208,6 @@ class _ObjectMessages:
         if result.jumps and not self._covers_jumps:
             values = np.where(near_jumps(result.jumps, self._rest), np.nan, values)
         return vertices, values.astype(np.float32)
-
-
-def _inner_vertices(structure: CarriedStructure, result: FrameResult, found: Estimate) -> NDArray[np.float32]:
-    """Deformed vertices (p, 3) of a structure inside."""
-    vertices = structure.nodes(found.state.parameters)
-    if result.discrepancy is not None:
-        vertices = vertices + result.discrepancy.displacement(structure.rest)
-    return vertices.astype(np.float32)
 
 
 def _parameter_info(parameter: Parameter) -> ParameterInfo:
