@@ -23,6 +23,7 @@ from morph_dslam.identification.doubts import check_size
 from morph_dslam.identification.measurements import MeasuredForces, Measurement
 from morph_dslam.identification.prior import KnownValues
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.tracking.flat_sides import LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 
 Array = NDArray[np.float64]
@@ -32,6 +33,8 @@ FACTOR, FACTOR_RANGE = "moduli_factor", (0.01, 100.0)
 STARTS, ROUNDS = 8, 4
 #: An estimate so near to an end of its range, over the range, is at it.
 AT_THE_END = 1e-6
+#: Values of a parameter at which the whole range is searched for others that fit as well.
+PLACES = 49
 #: Logarithms of factors are cut here.
 LARGEST = 700.0
 
@@ -288,7 +291,7 @@ class _Fit:
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
             )
         spread = self._spread(jacobian, self._residuals(theta), errors)
-        estimates = self._estimates(theta, spread, at_bound)
+        estimates = self._estimates(theta, spread, at_bound, self._alike(theta, jacobian, spread))
         std = np.sqrt(np.diag(spread.covariance))
         products = np.outer(std, std)
         # What is fitted without any error has no deviation.
@@ -296,12 +299,34 @@ class _Fit:
         misfits = self._misfits(theta, jacobian[:, ~at_bound], errors)
         return Identification(estimates, correlation, misfits, spread.groups)
 
-    def _estimates(self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_]) -> tuple[Estimate, ...]:
+    def _alike(self, theta: Array, jacobian: Array, spread: _Spread) -> Array:
+        """How far (k, 2) below and above each estimate its range has values that fit nearly as well.
+
+        What is told by a contact may be anything before it. There the sum of squares rises by less than the derivatives
+        say it does two standard deviations away.
+        """
+        least, std = float(np.sum(self._residuals(theta) ** 2)), np.sqrt(np.diag(spread.covariance))
+        found = np.zeros((len(theta), 2))
+        for i, away in enumerate(LOOK * std):
+            rise = float(np.sum((away * jacobian[:, i]) ** 2))
+            for value in np.linspace(0.0, 1.0, PLACES):
+                there = np.where(np.arange(len(theta)) == i, value, theta)
+                if abs(value - theta[i]) > away and np.sum(self._residuals(there) ** 2) < least + rise:
+                    side = int(value > theta[i])
+                    found[i, side] = max(found[i, side], abs(value - theta[i]))
+        return found
+
+    def _estimates(
+        self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_], alike: Array
+    ) -> tuple[Estimate, ...]:
+        """Those with values that fit ``alike`` (k, 2) have wider intervals."""
         scatter, known, model = (np.diag(part) for part in (spread.scatter, spread.known, spread.model))
         std = np.sqrt(scatter + known + model)
         of_scatter = float(t.ppf(0.975, max(spread.groups - len(theta), 1)))
         half = np.sqrt(of_scatter**2 * scatter + float(norm.ppf(0.975)) ** 2 * (known + model))
-        low, high, value = self._si(theta - half), self._si(theta + half), self._si(theta)
+        below, above = np.maximum(half[:, None], alike).T
+        low, high, value = self._si(theta - below), self._si(theta + above), self._si(theta)
+        std = np.sqrt(std**2 + flat_variance(alike.max(axis=1)))
         # Over the factor's logarithm a deviation is a relative one.
         slope = np.where(self._log, value, 1.0) * np.diff(self._ends, axis=1)[:, 0]
         return tuple(

@@ -172,6 +172,8 @@ class Estimate:
     stated_covariance : the covariance before the residuals widen it, by what they show that model and reference are off
         by; None where they do not.
     by_model : what the model's own errors have added to the covariance; None where they have not.
+    flat : (d,) variances that come to those of the parameters, but not to those of shape, stress and forces, because a
+        parameter changes nothing on one side (`flat_sides`); None where all do.
     """
 
     state: State
@@ -185,6 +187,7 @@ class Estimate:
     measured_covariance: Array | None = None
     stated_covariance: Array | None = None
     by_model: ModelDeviation | None = None
+    flat: Array | None = None
 
     @property
     def image_covariance(self) -> Array:
@@ -208,7 +211,8 @@ class Estimate:
     @property
     def parameter_std(self) -> Array:
         """Standard deviations of the parameters (d,), SI; very large where the images do not tell."""
-        return np.sqrt(np.diag(self.covariance)[: len(self.state.parameters)])
+        variances = np.diag(self.covariance)[: len(self.state.parameters)]
+        return np.sqrt(variances if self.flat is None else variances + self.flat)
 
     @property
     def stated_std(self) -> Array:

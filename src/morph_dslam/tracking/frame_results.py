@@ -13,6 +13,7 @@ from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, largest_jump
 from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.known_check import refuted_values
 from morph_dslam.tracking.outcomes import (
@@ -178,6 +179,20 @@ def with_model_errors(
     by_model = replace(by_model, parameters=added[:d, :d])
     covariance += added
     return replace(result, estimate=replace(estimate, covariance=covariance, by_model=by_model))
+
+
+def with_flat_sides(result: FrameResult, sides: FlatSides) -> FrameResult:
+    """The result with wider deviations of parameters that change nothing on one side, see `flat_sides`.
+
+    Parameters
+    ----------
+    result : of a frame, with all errors in its deviations.
+    sides : of its model.
+    """
+    estimate = result.estimate
+    if estimate is None or (flat := sides.variances(estimate.state.parameters, estimate.parameter_std)) is None:
+        return result
+    return replace(result, estimate=replace(estimate, flat=flat))
 
 
 def pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:

@@ -25,8 +25,9 @@ from morph_dslam.sources.frames import MissingFrame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
+from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_estimation import new_filter
-from morph_dslam.tracking.frame_results import with_model_errors
+from morph_dslam.tracking.frame_results import with_flat_sides, with_model_errors
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.measurement import PATCH_WINDOW
@@ -359,6 +360,7 @@ class RigTracker:
         self._filter = new_filter(self.estimator, self.options)
         self._errors = RigErrors(self.trackers, self.cameras)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
+        self._flat_sides = FlatSides(self.model)
         self._sigma_px = FIRST_SIGMA_PX
 
     @property
@@ -452,7 +454,7 @@ class RigTracker:
         errors, nothing = self._model_errors, np.empty(0, dtype=np.int64)
         if errors is not None:
             errors = errors.where_known(nothing, found.pose_from.is_of_frame_alone)
-        return with_model_errors(found, errors)
+        return with_flat_sides(with_model_errors(found, errors), self._flat_sides)
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""

@@ -80,7 +80,8 @@ def covariance_of_parameters(estimate: Estimate) -> Array:
     """(d, d), from the images and what is known of the pose, without a prior on the parameters."""
     d = len(estimate.state.parameters)
     measured = estimate.measured_covariance
-    return (estimate.image_covariance if measured is None else measured)[:d, :d]
+    covariance = (estimate.image_covariance if measured is None else measured)[:d, :d]
+    return covariance if estimate.flat is None else covariance + np.diag(estimate.flat)
 
 
 def unobservable_in_run(

@@ -25,6 +25,7 @@ from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
 from morph_dslam.tracking.estimator import Estimator, Prior, State
+from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_estimation import (
     a_turn_back,
     at_constant_velocity,
@@ -36,6 +37,7 @@ from morph_dslam.tracking.frame_results import (
     pose_source,
     tracked_result,
     warnings_of_place,
+    with_flat_sides,
     with_model_errors,
 )
 from morph_dslam.tracking.gaps import FrameGaps
@@ -157,6 +159,7 @@ class Tracker:
         check_pose(self.options, registration, in_map)
         self.estimator = Estimator(self.model, camera, self.options.estimation)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
+        self._flat_sides = FlatSides(self.model)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
         use, sought = self.options.use_discrepancy, self.options.discrepancy
@@ -222,6 +225,7 @@ class Tracker:
             held = None if systematic is None or not len(measured) else systematic.held(measured)
             change = self._choose_view(image, hypothesis, result)
             result = with_model_errors(result, self._errors_now(result.pose_from), held)
+            result = with_flat_sides(result, self._flat_sides)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
