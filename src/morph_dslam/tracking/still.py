@@ -232,16 +232,19 @@ class StillProblem:
         own = own.copy()
         own[self._constant] = state.parameters[self._constant]
         model, free, left = self._model, self._free, np.zeros_like(pixels)
+        ranges = (model.upper - model.lower)[free]
         for step in range(STEPS + 1):
             at = replace(state, parameters=own)
             _, hessian, gradient, left = estimator.evaluate(points, pixels, weights, at, normals, depths=depths)
             if step == STEPS or not len(free):
                 break
-            block = hessian[np.ix_(free, free)]
+            # In shares of the ranges: in pascals and metres, what is added would hold the pascals.
+            block = hessian[np.ix_(free, free)] * np.outer(ranges, ranges)
             block = block + 1e-9 * max(float(np.trace(block)), 1e-30) * np.eye(len(free))
-            change = bounded_step(block, gradient[free], (model.lower - own)[free], (model.upper - own)[free])
-            own[free] += change
-            if np.abs(change / (model.upper - model.lower)[free]).max() < 1e-6:
+            lower, upper = (model.lower - own)[free] / ranges, (model.upper - own)[free] / ranges
+            change = bounded_step(block, gradient[free] * ranges, lower, upper)
+            own[free] += change * ranges
+            if np.abs(change).max() < 1e-6:
                 break
         far = np.zeros(len(points)) if depths is None else depths.terms(points, replace(state, parameters=own))[3]
         return own, np.nan_to_num(left), weights, far
