@@ -36,3 +36,17 @@ def test_no_force_at_all_is_as_uncertain_as_its_least_known_direction():
     (largest,) = largest_forces(run)
     assert (largest["frame"], largest["force_N"]) == (12, pytest.approx(0.056))
     assert largest["standard_deviation_N"] == pytest.approx(0.049)
+
+
+@pytest.mark.parametrize("certain", [False, True])
+def test_where_no_force_is_told_from_zero_the_largest_that_may_have_acted_is_given(certain):
+    """0.8 N to 7.6 N, 120 N to 330 N and 200 N of which nothing is known; 10 N to 2 N is certain."""
+    known = [(0.8, 7.6), (120.0, 330.0), (200.0, np.inf)] + [(10.0, 2.0)] * certain
+    forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), std**2 * np.ones((3, 3))) for size, std in known]
+    none = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
+    reactions = {"x_min": [Reaction(np.zeros(3), force, none) for force in forces]}
+    run = SimpleNamespace(model=stretched_block_model(), frames=[3, 4, 5, 6], reactions=lambda: reactions)
+    run.frames = run.frames[: len(known)]
+    (largest,) = largest_forces(run)
+    figures = largest["differs_from_zero"], largest["frame"], largest["force_N"], largest["standard_deviation_N"]
+    assert figures == (certain, *((6, 10.0, 2.0) if certain else (4, 120.0, pytest.approx(330.0))))

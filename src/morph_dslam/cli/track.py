@@ -174,8 +174,13 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     for figures in summary["one_over_the_sequence"]:
         print(value_line(figures))
     for figures in summary["largest_forces"]:
-        line = "largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}".format(**figures)
-        print(line + _not_counted(figures))
+        line = "largest force, {on}: {force_N:.4g} ± {standard_deviation_N:.2g} N in frame {frame}"
+        if not figures["differs_from_zero"]:
+            line = (
+                "largest force, {on}: no frame tells a force apart from zero; the largest is {force_N:.3g} ± "
+                "{standard_deviation_N:.3g} N in frame {frame}"
+            )
+        print(line.format(**figures) + _not_counted(figures))
     for figures in summary.get("points", []):
         if "frame" in figures:
             line = "largest displacement of '{name}': {displacement_mm:.4g} ± {standard_deviation_mm:.2g} mm in frame "

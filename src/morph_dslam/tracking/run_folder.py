@@ -301,12 +301,15 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
     return summary
 
 
-#: A force is at least its length less so many standard deviations.
+#: A force is at least its length less so many standard deviations; one that may be zero by that is not told from it.
 CERTAIN = 2.0
 
 
 def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     """Of each support the force that is largest for certain, its standard deviation and frame; the largest one first.
+
+    Where none is told from zero it is the largest one with a finite deviation, as so much may have acted; supports of
+    which that holds come last.
 
     The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
     the reduction, and where it was estimated of the discretisation too.
@@ -317,16 +320,25 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
         if known:
             # A length that consists of what is not determined is no force.
             largest, frame = max(
-                ((reaction.force, frame) for reaction, frame in known),
-                key=lambda one: (one[0].size - CERTAIN * one[0].size_std, one[0].size),
+                ((reaction.force, frame) for reaction, frame in known), key=lambda one: _certainty(one[0])
             )
             figures = {"on": name, "force_N": largest.size, "standard_deviation_N": largest.size_std, "frame": frame}
+            figures["differs_from_zero"], *_ = _certainty(largest)
             figures["not_counted"] = uncounted(run.model)
             error = force_error(run.model, name)
             if error is not None:
                 figures |= {"model_error": error[0], "model_error_of": "all" if error[1] else "reduction"}
             found.append(figures)
-    return sorted(found, key=lambda figures: -float(figures["force_N"]))
+    return sorted(found, key=lambda figures: (not figures["differs_from_zero"], -float(figures["force_N"])))
+
+
+def _certainty(force: VectorEstimate) -> tuple[bool, bool, float]:
+    """Whether a force is told from zero and determined at all, and its size by that: a run's largest has the most."""
+    least = force.size - CERTAIN * force.size_std
+    if least > 0.0:
+        return True, True, least
+    # Of forces that may be zero, ``least`` would choose the least deviation, whatever the force.
+    return False, bool(np.isfinite(force.size_std)), force.size
 
 
 def largest_of_points(run: RunResults) -> list[dict[str, Any]]:

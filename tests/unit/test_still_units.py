@@ -1,0 +1,60 @@
+"""One pose over a sequence of a model whose parameters are millions in one unit and thousandths in another."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.known_state import LandmarkTerm
+from morph_dslam.tracking.refinement import Keyframe
+from morph_dslam.tracking.still import StillProblem, fit_still
+from tests.support.bent_sheet import sheet_mesh
+from tests.support.measured_points import bound_points
+from tests.support.rendered_sequence import CAMERA, UPRIGHT
+
+YOUNG_MODULUS, POISSON_RATIO, LANDMARK_PX = 1e6, 0.3, 0.5
+POSE = RigidTransform(UPRIGHT, np.array([0.0, 0.0, 0.6]))
+NODES, TRIANGLES = sheet_mesh(9, 7)
+UPPER = np.array([0.01, 2e5])
+PARAMETERS = (
+    Parameter("bow", "length", "mm", -UPPER[0], UPPER[0], 0.0, "motion of the middle along the sheet"),
+    Parameter("pull", "stress", "kPa", -UPPER[1], UPPER[1], 0.0, "traction at both ends"),
+)
+
+
+def pulled_sheet():
+    """A flat sheet in plane stress: u = (bow (1 - s^2) + x pull / E, -nu y pull / E, 0), s = -1 and 1 at the ends."""
+    x, y = NODES[:, 0], NODES[:, 1]
+    zero = np.zeros(len(NODES))
+    bow = np.column_stack([1.0 - (x / x.max()) ** 2, zero, zero])
+    pull = np.column_stack([x, -POISSON_RATIO * y, zero]) / YOUNG_MODULUS
+    linear = ParameterFunctions(-UPPER, UPPER, np.eye(2, dtype=np.int64), np.diag(UPPER))
+    return ReducedModel("pulled sheet", NODES, TRIANGLES, PARAMETERS, SeparatedField(np.stack([bow, pull]), linear))
+
+
+def test_a_traction_beside_a_length_is_known_as_well_as_landmarks_tell_it():
+    """Frames of other tractions show the strain since the reference frame alone, not the strain there.
+
+    Facing the sheet, landmarks give the scales e - z along x and -nu e - z along y, e the strain and z the relative
+    change of the distance, with the deviations of two regressions through the origin.
+    """
+    model, points = pulled_sheet(), bound_points(pulled_sheet(), 120)
+    truth = np.array([0.0, 2e4])
+    landmarks = Landmarks(NODES, CAMERA.project(POSE.apply(model.positions(truth))))
+    known = LandmarkTerm(bind_landmarks(model, landmarks.points), landmarks.pixels, LANDMARK_PX)
+
+    def seen(pull):
+        return CAMERA.project(points.in_camera(State(np.array([0.0, pull]), POSE)))
+
+    frames = [Keyframe(seen(pull), np.ones(120), State(np.array([0.0, pull]), POSE), 0.3) for pull in (0.0, 4e4, 8e4)]
+    along, across = np.sum((CAMERA.fx * NODES[:, :2] / POSE.translation[2]) ** 2, axis=0)
+    strain_std = LANDMARK_PX * np.sqrt(1.0 / along + 1.0 / across) / (1.0 + POISSON_RATIO)
+    expected = YOUNG_MODULUS * strain_std
+    start = State(truth + np.array([0.0, 3.0 * expected]), POSE)
+    found = fit_still(StillProblem(model, CAMERA, start, seen(truth[1]), frames, known))
+    assert np.sqrt(found.covariance[1, 1]) == pytest.approx(expected, rel=0.05)
+    assert abs(found.state.parameters[1] - truth[1]) < 0.05 * expected
