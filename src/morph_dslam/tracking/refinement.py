@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -197,12 +198,13 @@ def minimum(
     steps that SciPy takes by itself are shares of the unknowns, and vanish where these are zero.
     """
 
-    def jacobian(unknowns: Array) -> Array:
-        inside = np.where(unknowns + DIFFERENCE > bounds[1], -DIFFERENCE, DIFFERENCE)
-        return np.asarray(approx_fprime(unknowns, residuals, inside))
-
-    derivatives: Any = jacobian  # SciPy's types know names of methods only
+    derivatives: Any = partial(differences, residuals, bounds=bounds)  # SciPy's types know names of methods only
     return least_squares(residuals, start, derivatives, bounds, max_nfev=steps, ftol=1e-4)
+
+
+def differences(residuals: Callable[[Array], Array], at: Array, bounds: tuple[Array, Array]) -> Array:
+    """Derivatives (r, k) at some unknowns (k,) by differences over `DIFFERENCE`, to where it is within the bounds."""
+    return np.asarray(approx_fprime(at, residuals, np.where(at + DIFFERENCE > bounds[1], -DIFFERENCE, DIFFERENCE)))
 
 
 def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe) -> Array:

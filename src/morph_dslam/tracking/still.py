@@ -24,7 +24,7 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
-from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, Keyframe, minimum
+from morph_dslam.tracking.refinement import DIFFERENCE, EFFECTIVE_POINTS, Keyframe, differences, minimum
 from morph_dslam.tracking.state import Prior, pose_increment
 
 Array = NDArray[np.float64]
@@ -37,6 +37,10 @@ TERM_STD: dict[CameraTerm, float] = {"focal": 0.3, "radial": 0.05}
 LEAST_SIGMA_PX = 0.3
 #: Rounds with weights by the residuals of the round before; steps of a keyframe's own parameters.
 ROUNDS, STEPS = 2, 6
+#: Scale of a parameter of the reference state, as a share of half its range.
+SHARE_OF_RANGE = 0.05
+#: The least information of a keyframe's own parameter that counts, as a share of that of all.
+LEAST_SEEN = 1e-9
 #: Unknowns closer than this, scaled, are the same minimum; twice the log-likelihood ratio that excludes another one.
 SAME, EXCLUDED = 1.0, 9.0
 #: How much more than by a frame's own points a pose counts that is one over the sequence.
@@ -104,7 +108,7 @@ class StillProblem:
         self._constant, self._terms, d = list(constant), tuple(terms), len(model.parameters)
         self._free = np.setdiff1d(np.arange(d), self._constant)
         half_ranges = 0.5 * (model.upper - model.lower)
-        self._scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+        self._scale = np.concatenate([SHARE_OF_RANGE * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
         self._columns = np.setdiff1d(np.arange(d + 6), known_at_first)
         # As recorded, so that another lens can undistort them.
         self._reference = camera.distort_pixels(reference_pixels)
@@ -166,8 +170,13 @@ class StillProblem:
             camera = replace(camera, distortion=(first + change, *others))
         return camera
 
-    def residuals(self, unknowns: Array) -> Array:
-        """Of landmarks, camera terms and keyframes, each in its standard deviations."""
+    def residuals(self, unknowns: Array, refit: bool = True) -> Array:
+        """Of landmarks, camera terms and keyframes, each in its standard deviations.
+
+        Parameters
+        ----------
+        refit : whether the keyframes' own parameters follow; they are as they were otherwise.
+        """
         state, camera = self.state(unknowns), self.camera(unknowns)
         estimator = Estimator(self._model, camera, EstimationOptions())
         surface, met = bind_pixels(
@@ -175,10 +184,49 @@ class StillProblem:
         )
         points = BoundPoints.from_surface(self._model, surface)
         parts = [self._known.residuals(camera, state), unknowns[len(self._columns) :]]
-        return np.concatenate([*parts, *self._of_keyframes(estimator, points, met, state)])
+        return np.concatenate([*parts, *self._of_keyframes(estimator, points, met, state, STEPS if refit else 0)])
+
+    def jacobian(self, unknowns: Array) -> Array:
+        """Derivatives (r, n) of the residuals, as if the keyframes' own parameters had no bounds.
+
+        One that is held at a bound cannot follow on that side: the residuals that this leaves rise at once, and would
+        pass for information about the other side too. So these are derivatives at given own parameters, less what a
+        change of those makes good (Kaufman 1975).
+        """
+        here = self.residuals(unknowns)
+        found = differences(lambda at: self.residuals(at, refit=False), unknowns, self.bounds())
+        kept, by_own, upper = self._own, np.empty((len(here), len(self._free))), self._model.upper
+        for column, k in enumerate(self._free):
+            step = DIFFERENCE * np.diag(self._scale[: len(upper)])[k]
+            self._own = [own - step if own[k] + step[k] > upper[k] else own + step for own in kept]
+            by_own[:, column] = self.residuals(unknowns, refit=False) - here
+        self._own = kept
+        for rows in self._rows(len(here)):
+            made_good = np.linalg.lstsq(by_own[rows], found[rows], rcond=np.sqrt(LEAST_SEEN))[0]
+            found[rows] -= by_own[rows] @ made_good
+        return found
+
+    def _rows(self, count: int) -> list[slice]:
+        """Of each keyframe's among so many residuals."""
+        found: list[slice] = []
+        for frame in reversed(self._recorded):
+            begin = count - self._n_pixels(frame) - self._n_depths(frame)
+            found.append(slice(begin, count))
+            count = begin
+        return found[::-1]
+
+    @staticmethod
+    def _n_pixels(frame: Keyframe) -> int:
+        """How many residuals a keyframe has of pixels, the points' first."""
+        return 2 * (len(frame.pixels) + (0 if frame.outline is None else len(frame.outline.pixels)))
+
+    @staticmethod
+    def _n_depths(frame: Keyframe) -> int:
+        """How many it has of depths, the last ones."""
+        return 0 if frame.depths is None else len(frame.pixels)
 
     def _of_keyframes(
-        self, estimator: Estimator, points: BoundPoints, met: NDArray[np.bool_], state: State
+        self, estimator: Estimator, points: BoundPoints, met: NDArray[np.bool_], state: State, steps: int
     ) -> Iterator[Array]:
         """The scaled residuals of each keyframe; 0 for points of the reference view that met nothing."""
         n_met = int(met.sum())
@@ -187,7 +235,7 @@ class StillProblem:
             of_pixels, of_depths = self._sigmas[number]
             depths = None if frame.depths is None else frame.depths.take(met)
             found, left, weights, far = self._fitted(
-                estimator, frame.measured(points, met), depths, state, self._own[number]
+                estimator, frame.measured(points, met), depths, state, self._own[number], steps
             )
             self._own[number] = found
             huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
@@ -202,16 +250,10 @@ class StillProblem:
 
     def weigh(self, residuals: Array) -> None:
         """Take the keyframes' standard deviations from what ``residuals`` left of them."""
-        end = len(residuals)
-        for number in reversed(range(len(self._recorded))):
-            frame = self._recorded[number]
-            n_points, n_outline = len(frame.pixels), 0 if frame.outline is None else len(frame.outline.pixels)
-            n_depths = 0 if frame.depths is None else n_points
-            begin, middle = end - 2 * (n_points + n_outline) - n_depths, end - n_depths
-            pixels, depths = residuals[begin:middle], residuals[middle:end]
+        for number, rows in enumerate(self._rows(len(residuals))):
+            pixels, depths = np.split(residuals[rows], [self._n_pixels(self._recorded[number])])
             rms = np.sqrt([np.sum(pixels**2) / (2.0 * EFFECTIVE_POINTS), np.sum(depths**2) / EFFECTIVE_POINTS])
             self._sigmas[number] = np.maximum(self._sigmas[number] * rms, self._floors[number])
-            end = begin
 
     def _fitted(
         self,
@@ -220,8 +262,9 @@ class StillProblem:
         depths: PointDepths | None,
         state: State,
         own: Array,
+        steps: int,
     ) -> tuple[Array, Array, Array, Array]:
-        """A keyframe at its best in the pose of ``state``.
+        """A keyframe at its best in the pose of ``state``, by so many steps at most.
 
         Returns
         -------
@@ -233,14 +276,14 @@ class StillProblem:
         own[self._constant] = state.parameters[self._constant]
         model, free, left = self._model, self._free, np.zeros_like(pixels)
         ranges = (model.upper - model.lower)[free]
-        for step in range(STEPS + 1):
+        for step in range(steps + 1):
             at = replace(state, parameters=own)
             _, hessian, gradient, left = estimator.evaluate(points, pixels, weights, at, normals, depths=depths)
-            if step == STEPS or not len(free):
+            if step == steps or not len(free):
                 break
             # In shares of the ranges: in pascals and metres, what is added would hold the pascals.
             block = hessian[np.ix_(free, free)] * np.outer(ranges, ranges)
-            block = block + 1e-9 * max(float(np.trace(block)), 1e-30) * np.eye(len(free))
+            block = block + LEAST_SEEN * max(float(np.trace(block)), 1e-30) * np.eye(len(free))
             lower, upper = (model.lower - own)[free] / ranges, (model.upper - own)[free] / ranges
             change = bounded_step(block, gradient[free] * ranges, lower, upper)
             own[free] += change * ranges
@@ -249,10 +292,13 @@ class StillProblem:
         far = np.zeros(len(points)) if depths is None else depths.terms(points, replace(state, parameters=own))[3]
         return own, np.nan_to_num(left), weights, far
 
-    def fitted(self, unknowns: Array, jacobian: Array) -> StillFit:
-        """The result at the minimum, with the residuals' ``jacobian`` (r, n) there."""
+    def fitted(self, unknowns: Array) -> StillFit:
+        """The result at the minimum."""
         n, state, camera = len(self._columns), self.state(unknowns), self.camera(unknowns)
-        values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+        jacobian = self.jacobian(unknowns)
+        # Before anything is measured, a parameter is known to half its range.
+        is_parameter = np.append(self._columns < len(self._model.parameters), np.zeros(len(self._terms)))
+        values, vectors = np.linalg.eigh(jacobian.T @ jacobian + np.diag(SHARE_OF_RANGE**2 * is_parameter))
         inverse = (vectors / np.maximum(values, 1e-9 * max(values[-1], 1e-30))) @ vectors.T
         to_state = np.zeros((len(self._scale), self.size))
         to_state[self._columns, np.arange(n)] = self._scale[self._columns]
@@ -303,7 +349,7 @@ def fit_still(problem: StillProblem, alternatives: Sequence[State] = ()) -> Stil
         best = min(minima, key=lambda one: one.cost)
     apart = [one for one in minima if np.abs(one.x - best.x).max() > SAME]
     decided = all(2.0 * (one.cost - best.cost) > EXCLUDED for one in apart)
-    return replace(problem.fitted(best.x, best.jac), decided=decided)
+    return replace(problem.fitted(best.x), decided=decided)
 
 
 def _minimum(problem: StillProblem, start: Array) -> OptimizeResult:
