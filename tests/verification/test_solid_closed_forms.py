@@ -13,7 +13,7 @@ from morph_dslam.mechanics.loads import BodyForce, DeadTraction
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.materials.isotropic import NeoHookean, StVenantKirchhoff
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.mechanics.solvers.newton import solve
+from morph_dslam.mechanics.solvers.newton import sensitivities, solve
 from morph_dslam.mechanics.supports import PrescribedDisplacement, fixed
 from morph_dslam.meshing.extrusion import Hole, extrusion
 from morph_dslam.meshing.generators import block
@@ -44,6 +44,29 @@ def test_uniaxial_stretch(material: Material, lateral: float, stress: float, cel
     fields = problem.recovery.at_nodes(state.dofs, state.mu, ("first_piola_kirchhoff", "stress"))
     np.testing.assert_allclose(fields["first_piola_kirchhoff"][:, 0], stress, rtol=2e-6)
     np.testing.assert_allclose(fields["von_mises"], stress / lateral**2, rtol=3e-6)
+
+
+@pytest.mark.parametrize("cell_type", ["hex8", "hex20", "tet10"])
+@pytest.mark.parametrize("soft_first", [True, False])
+def test_stress_where_materials_meet_is_that_of_the_stiffer_one(cell_type: str, soft_first: bool) -> None:
+    """Layers stretched along their plane; without Poisson's effect the Cauchy stress is E (l - 1 / l) / 2 in each."""
+    young = (1e5, 1e6) if soft_first else (1e6, 1e5)
+    mesh = block((1.0, 1.0, 1.0), (1, 1, 4), cell_type)
+    heights = np.concatenate([mesh.nodes[part.connectivity, 2].mean(axis=1) for part in mesh.blocks])
+    mesh = replace(mesh, cell_sets={"low": np.flatnonzero(heights < 0.5), "high": np.flatnonzero(heights > 0.5)})
+    symbols = load_parameter(pull=0.0)
+    supports = [*ROLLERS, PrescribedDisplacement("x_max", x=symbols["pull"])]
+    materials = {name: NeoHookean(young=E, poisson=0.0) for name, E in zip(("low", "high"), young, strict=True)}
+    problem = SolidProblem(mesh, materials, supports, parameters=symbols)
+    state = solved(problem, 0.3)
+    stretched = 0.5 * (1.3 - 1.0 / 1.3)
+    z = mesh.nodes[:, 2]
+    expected = stretched * np.where(np.abs(z - 0.5) < 1e-9, max(young), np.where(z < 0.5, *young))
+    fields = problem.recovery.at_nodes(state.dofs, state.mu)
+    np.testing.assert_allclose(fields["stress"][:, 0], expected, rtol=1e-6)
+    # By d/dl (l - 1 / l) / 2, with l = 1 + pull.
+    slopes = problem.recovery.slopes_at_nodes(state.dofs, state.mu, sensitivities(problem, state))["stress"][0, :, 0]
+    np.testing.assert_allclose(slopes, expected / stretched * 0.5 * (1.0 + 1.3**-2), rtol=1e-6)
 
 
 def test_uniaxial_traction_is_the_inverse_of_stretch() -> None:

@@ -1,8 +1,10 @@
 """Fields of a solved solid at its nodes, and their derivatives by the parameters.
 
 Stresses and strains are taken at the quadrature points where they are most accurate (two in each direction: Barlow,
-IJNME 10, 1976), extrapolated within each cell and averaged, unweighted, over the cells around the node, across
-materials too; elements of third order, and others on request, give them at the nodes. Displacements need none of this.
+IJNME 10, 1976), extrapolated within each cell and averaged, unweighted, over the cells around the node; elements of
+third order, and others on request, give them at the nodes. Where materials meet, stress and strain jump, and an average
+would belong to none: the cells of the stiffest one count alone, which mostly bears the largest stress. Displacements
+need none of this.
 Derivatives are total: by the displacements and pressures, which follow the parameters, and by the parameters where
 constants or the undeformed shape contain them.
 """
@@ -33,6 +35,8 @@ Array = NDArray[np.float64]
 #: Components of each field: symmetric tensors in Voigt's order (xx, yy, zz, yz, xz, xy), others row by row.
 COMPONENTS = {"deformation_gradient": 9, "strain": 6, "first_piola_kirchhoff": 9, "stress": 6}
 STRESSES = ("first_piola_kirchhoff", "stress")
+#: Materials whose stiffness differs by a smaller share count as one.
+ALIKE = 1e-9
 _VOIGT_COLUMNS = [3 * i + j for i, j in VOIGT]
 
 
@@ -287,7 +291,8 @@ class Recovery:
             order = 3 if self._problem.options.at_nodes else self._problem.displacements.order
             mesh, parts, count = geometry.mesh, [], 0
             rows, columns, data = [], [], []
-            for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
+            counted = self._counted_cells()
+            for block, start, counts in zip(mesh.blocks, mesh.block_starts()[:-1], counted, strict=True):
                 reference, weights = _extrapolation(block.type, order)
                 m, q = len(block.connectivity), len(reference)
                 elements = np.repeat(geometry.element_of_cell[start : start + m], q)
@@ -296,10 +301,12 @@ class Recovery:
                 numbers = count + np.arange(m * q).reshape(m, 1, q)
                 rows.append(np.broadcast_to(block.connectivity[:, :, None], (m, *weights.shape)).ravel())
                 columns.append(np.broadcast_to(numbers, (m, *weights.shape)).ravel())
-                data.append(np.broadcast_to(weights, (m, *weights.shape)).ravel())
+                data.append((counts[:, :, None] * weights).ravel())
                 count += m * q
             cells_around = np.bincount(
-                np.concatenate([b.connectivity.ravel() for b in mesh.blocks]), minlength=mesh.n_nodes
+                np.concatenate([b.connectivity.ravel() for b in mesh.blocks]),
+                np.concatenate([counts.ravel() for counts in counted]),
+                mesh.n_nodes,
             )
             i = np.concatenate(rows)
             matrix = sp.csr_matrix(
@@ -307,6 +314,27 @@ class Recovery:
             )
             self._at_nodes = np.concatenate(parts), matrix
         return self._at_nodes
+
+    def _counted_cells(self) -> list[Array]:
+        """Of each block of cells, 1 for the nodes (m, k) around which no other cell is stiffer, and 0 for others.
+
+        Stiffness is the shear modulus at small strain and at the parameters' defaults, so that it is the same in all
+        solutions.
+        """
+        problem, mesh = self._problem, self._problem.geometry.mesh
+        corners = [block.connectivity for block in mesh.blocks]
+        if len(problem.regions) == 1:
+            return [np.ones(nodes.shape) for nodes in corners]
+        problem.symbols.set(problem.symbols.default)
+        _, shear = problem.cell_moduli()
+        stiffest = np.zeros(mesh.n_nodes)
+        own = [part[:, None] for part in np.split(shear, mesh.block_starts()[1:-1])]
+        for nodes, stiffness in zip(corners, own, strict=True):
+            np.maximum.at(stiffest, nodes, np.broadcast_to(stiffness, nodes.shape))
+        return [
+            (stiffness >= (1.0 - ALIKE) * stiffest[nodes]).astype(np.float64)
+            for nodes, stiffness in zip(corners, own, strict=True)
+        ]
 
 
 def _extrapolation(kind: CellType, order: int) -> tuple[Array, Array]:

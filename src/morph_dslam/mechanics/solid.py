@@ -243,10 +243,15 @@ class SolidProblem:
     def _make_contact(self, contacts: Sequence[Contact]) -> ContactAssembly | None:
         if not contacts:
             return None
-        moduli = [isotropic_average(region.material.small_strain_stiffness()) for region in self.regions]
-        bulk, shear = np.array(moduli)[np.searchsorted(np.unique(self.cell_materials), self.cell_materials)].T
+        bulk, shear = self.cell_moduli()
         asked, factor = partial(stiffening, self), self.options.contact
         return ContactAssembly(self.displacements, self.shape, contacts, bulk, shear, self.symbols, asked, factor)
+
+    def cell_moduli(self) -> tuple[Array, Array]:
+        """Bulk and shear modulus (m,) of each cell at small strain and at the parameters' present values, Pa."""
+        moduli = [isotropic_average(region.material.small_strain_stiffness()) for region in self.regions]
+        bulk, shear = np.array(moduli)[np.searchsorted(np.unique(self.cell_materials), self.cell_materials)].T
+        return bulk, shear
 
     def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
         if isinstance(load, PointLoad):
