@@ -15,6 +15,7 @@ from morph_dslam.evaluation.trajectory import (
     match,
     relative_error,
     statistics,
+    trajectory_line,
 )
 from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
 from tests.support.real_data import real_data
@@ -119,6 +120,52 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, capsys):
     assert figures["truth_length_m"] == pytest.approx(4.0 * np.sqrt(1.04), rel=1e-3)
     assert figures["sim3"]["absolute_mm"]["max"] < 1e-3
     assert (run / "trajectory_evaluation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def at(positions, step=0.1):
+    """Poses that do not turn, at given places (n, 3)."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    return Trajectory(step * np.arange(len(positions)), poses)
+
+
+def test_a_still_camera_has_no_scale_and_its_error_is_the_scatter(tmp_path):
+    rng = np.random.default_rng(0)
+    scatter = 0.002 * rng.standard_normal((61, 3))
+    place = [0.06, -0.29999999999999993, 0.049999999999999996]
+    rms = 1e3 * np.sqrt(((scatter - scatter.mean(axis=0)) ** 2).sum(axis=1).mean())
+    drift = 1e3 * np.sqrt(((scatter[10:] - scatter[:-10]) ** 2).sum(axis=1).mean())
+    save_trajectory(tmp_path / "path.txt", at(place + scatter))
+    jitter = 1e-4 * rng.standard_normal((61, 3))
+    for truth, word in ((at(np.tile(place, (61, 1))), "stands still"), (at(place + jitter), "spreads by 0.1")):
+        figures = evaluate_trajectory(tmp_path / "path.txt", truth)
+        assert figures["sim3"] is None
+        assert figures["se3"]["absolute_mm"]["rmse"] == pytest.approx(rms, rel=0.02)
+        assert figures["se3"]["relative_mm"]["rmse"] == pytest.approx(drift, rel=0.02)
+        (note,) = figures["notes"]
+        assert word in note
+        assert "no scale" in note
+        line = trajectory_line(figures)
+        assert f"ate_se3_mm={figures['se3']['absolute_mm']['rmse']:.2f} ate_sim3_mm=nan scale=nan" in line
+        assert json.loads((tmp_path / "path_evaluation.json").read_text())["sim3"] is None
+
+
+def test_an_estimate_that_stands_still_is_off_by_the_true_path():
+    truth = helix()
+    spread = 1e3 * np.sqrt(truth.positions.var(axis=0).sum())
+    figures = evaluate_trajectory(at(np.tile([0.1, 0.7, -1.3], (61, 1))), at(truth.positions))
+    assert figures["sim3"] is None
+    assert figures["se3"]["absolute_mm"]["rmse"] == pytest.approx(spread, rel=1e-9)
+    (note,) = figures["notes"]
+    assert "the estimated path stands still" in note
+
+
+def test_a_drift_beside_a_smaller_one_is_no_wrong_unit():
+    way = np.linspace(0.0, 1.0, 61)[:, None] * [1.0, 0.5, 0.2]
+    assert evaluate_trajectory(at(0.004 * way), at(0.0002 * way))["notes"] == []
+    # A path in millimetres is one.
+    (note,) = evaluate_trajectory(at(1000.0 * way), at(way))["notes"]
+    assert "0.001 times as large" in note
 
 
 def test_mistakes_in_paths_are_named(tmp_path):

@@ -21,7 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.points import MaterialError, millimetres
-from morph_dslam.evaluation.trajectory_notes import check_numbers, clock_advice, pair_notes, pose_notes, size_notes
+from morph_dslam.evaluation.trajectory_notes import (
+    check_numbers,
+    clock_advice,
+    no_scale,
+    pair_notes,
+    pose_notes,
+    size_notes,
+)
 from morph_dslam.geometry import SimilarityTransform, fit_similarity, rotation_log
 from morph_dslam.io.text import read_text
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
@@ -198,7 +205,7 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     Parameters
     ----------
     run : a run folder with ``trajectory.txt``, any trajectory file, or a trajectory in memory. If the map beside
-        ``trajectory.txt`` has no known scale, ``se3`` is None.
+        ``trajectory.txt`` has no known scale, ``se3`` is None; if one of the paths stands still, ``sim3`` is.
     truth : a trajectory or its file. One that has frame numbers for times belongs to the frames of a run folder.
 
     Returns
@@ -209,7 +216,7 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     ------
     EvaluationError
         If the run has no trajectory, or it and the truth do not overlap in time, or one has frame numbers
-        and the other seconds.
+        and the other seconds, or the scale is unknown and one of them stands still.
     TrajectoryError, MapError
         If one of them, or the run's map, cannot be read.
     """
@@ -230,8 +237,12 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
         "relative_interval_s": _interval(estimate),
     }
     errors = {}
+    is_metric = path is None or _is_in_metres(path)
+    still = no_scale(estimate, expected, is_metric)
+    if still and not is_metric:
+        raise EvaluationError(f"{still}, nor has the run's map: give a recording in which the camera moves")
     for name, with_scale in (("se3", False), ("sim3", True)):
-        if not with_scale and path is not None and not _is_in_metres(path):
+        if still if with_scale else not is_metric:
             figures[name] = None
             continue
         absolute = absolute_error(estimate, expected, with_scale)
@@ -245,12 +256,14 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
         }
         errors[name] = absolute, relative
     mistakes = [*pair_notes(len(estimate), loaded, whole), *pose_notes(estimate, expected)]
-    figures["notes"] = [*mistakes, *_scale_notes(figures, bool(mistakes))]
+    figures["notes"] = [*mistakes, *_scale_notes(figures, bool(mistakes), still, expected)]
     if path is not None:
         with writing(EvaluationError, path.parent):
             content, picture = trajectory_evaluation_files(path)
             content.write_text(json.dumps(figures, indent=2) + "\n")
-            plot_trajectory(picture, estimate, expected, *errors["sim3"])
+            shown, alignment = ("se3", "SE(3)") if still else ("sim3", "Sim(3)")
+            absolute, relative = errors[shown]
+            plot_trajectory(picture, estimate, expected, absolute, relative, alignment)
     return figures
 
 
@@ -303,32 +316,50 @@ def _interval(trajectory: Trajectory) -> float:
     return max(min(INTERVAL, 0.5 * float(times[-1] - times[0])), float(np.median(np.diff(times))))
 
 
-def _scale_notes(figures: dict[str, Any], are_wrong: bool) -> Iterator[str]:
-    """What a reader must know of the lengths of an evaluated path; ``are_wrong``: its times or poses are."""
+def _scale_notes(figures: dict[str, Any], are_wrong: bool, still: str, truth: Trajectory) -> Iterator[str]:
+    """What a reader must know of the lengths of an evaluated path.
+
+    Parameters
+    ----------
+    figures : of the evaluation.
+    are_wrong : whether its times or poses are.
+    still : why there is no scale, as `no_scale` says it.
+    truth : the true path.
+    """
     rigid, similar = figures["se3"], figures["sim3"]
-    if rigid is None:
+    if still:
+        yield f"{still}: there are no ate_sim3_mm and scale, and rpe_mm is that of the lengths as they are"
+    elif rigid is None:
         yield SCALE_UNKNOWN
     elif not are_wrong:
-        yield from size_notes(similar["scale"], rigid["absolute_mm"]["rmse"], similar["absolute_mm"]["rmse"])
+        yield from size_notes(similar["scale"], rigid["absolute_mm"]["rmse"], similar["absolute_mm"]["rmse"], truth)
 
 
 def trajectory_line(figures: dict[str, Any]) -> str:
     """The line that sums up an evaluation, below its notes."""
     rigid, similar = figures["se3"], figures["sim3"]
-    without_scale = np.nan if rigid is None else rigid["absolute_mm"]["rmse"]
+    relative = rigid if similar is None else similar
+    absolute = {
+        name: np.nan if figures[name] is None else figures[name]["absolute_mm"]["rmse"] for name in ("se3", "sim3")
+    }
     notes = "".join(f"note: {note}\n" for note in figures["notes"])
     return (
         f"{notes}pairs={figures['n_pairs']}/{figures['n_poses']} "
-        f"ate_se3_mm={without_scale:.2f} ate_sim3_mm={similar['absolute_mm']['rmse']:.2f} "
-        f"scale={similar['scale']:.4f} rpe_mm={similar['relative_mm']['rmse']:.2f} "
-        f"rpe_deg={similar['relative_deg']['rmse']:.3f}"
+        f"ate_se3_mm={absolute['se3']:.2f} ate_sim3_mm={absolute['sim3']:.2f} "
+        f"scale={np.nan if similar is None else similar['scale']:.4f} rpe_mm={relative['relative_mm']['rmse']:.2f} "
+        f"rpe_deg={relative['relative_deg']['rmse']:.3f}"
     )
 
 
 def plot_trajectory(
-    path: Path, estimate: Trajectory, truth: Trajectory, absolute: AbsoluteError, relative: RelativeError
+    path: Path,
+    estimate: Trajectory,
+    truth: Trajectory,
+    absolute: AbsoluteError,
+    relative: RelativeError,
+    alignment: str = "Sim(3)",
 ) -> None:
-    """The path beside the truth, seen along its thinnest direction, and the errors over time."""
+    """The path beside the truth, seen along its thinnest direction, and the errors after an ``alignment`` over time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.6), layout="constrained")
@@ -346,7 +377,7 @@ def plot_trajectory(
         relative.timestamps - start, 1e3 * relative.translations, color="#8fb3d9", linewidth=1.0, label="relative"
     )
     right.set_xlabel("time [s]")
-    right.set_ylabel("error after Sim(3) alignment [mm]")
+    right.set_ylabel(f"error after {alignment} alignment [mm]")
     right.set_ylim(bottom=0.0)
     right.legend(fontsize=8, frameon=False)
     rmse = statistics(1e3 * absolute.distances)["rmse"]

@@ -28,6 +28,10 @@ ALIKE = 1.25
 CALIBRATED_DEG, LEAST_ERROR_M = 3.0, 0.002
 #: Differences of turns that are rounding, degrees; the least part of the largest singular value that tells.
 ROUNDING_DEG, LEAST_SINGULAR = 1e-6, 1e-2
+#: A path that spreads by less stands still, metres: the rest is rounding.
+STILL_M = 1e-9
+#: A scale must explain this part of the variance of a true path that spreads less than the estimate is off.
+EXPLAINED = 0.5
 
 
 def pose_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
@@ -113,10 +117,10 @@ def _best_convention(estimate: Trajectory, truth: Trajectory) -> tuple[str, Traj
     return ways[alike[np.flatnonzero(errors <= CLEARLY * errors.min())[0]]]
 
 
-def _position_error(estimate: Trajectory, truth: Trajectory) -> float:
-    """Root mean square distance of the centres after the best similarity; infinite where there is none."""
+def _position_error(estimate: Trajectory, truth: Trajectory, with_scale: bool = True) -> float:
+    """Root mean square distance of the centres after the best similarity or motion; infinite where there is none."""
     try:
-        motion = fit_similarity(estimate.positions, truth.positions, with_scale=True)
+        motion = fit_similarity(estimate.positions, truth.positions, with_scale)
     except ValueError:
         return np.inf
     return float(np.sqrt(np.mean(np.sum((motion.apply(estimate.positions) - truth.positions) ** 2, axis=1))))
@@ -201,15 +205,44 @@ def clock_advice(estimate: Trajectory, truth: Trajectory) -> str:
     return "give the truth of this recording, on its clock"
 
 
-def size_notes(scale: float, rigid_rmse: float, similar_rmse: float) -> Iterator[str]:
+def _extent(path: Trajectory) -> float:
+    """Root mean square distance of the centres from their middle, metres."""
+    return float(np.sqrt(np.sum(np.var(path.positions, axis=0))))
+
+
+def no_scale(estimate: Trajectory, truth: Trajectory, is_metric: bool) -> str:
+    """Why matched paths give no scale, truth over estimate; empty where they do.
+
+    A similarity shrinks any estimate to a point, and so fits any to a truth that stands still. A true path that jitters
+    is no different: the errors of the estimate are larger, and no scale makes one of the other.
+
+    Parameters
+    ----------
+    estimate, truth : n poses each.
+    is_metric : whether the estimate's lengths are metres, so that its error without a scale means something.
+    """
+    own, true = _extent(estimate), _extent(truth)
+    if min(own, true) < STILL_M:
+        return f"the {'true' if true < STILL_M else 'estimated'} path stands still, and a still path has no scale"
+    off = _position_error(estimate, truth, with_scale=False) if is_metric else 0.0
+    if true < off and _position_error(estimate, truth) ** 2 > (1.0 - EXPLAINED) * true**2:
+        return (
+            f"the true path spreads by {1e3 * true:.2g} mm about its middle, less than the estimate is off "
+            f"({1e3 * off:.2g} mm), and has no scale"
+        )
+    return ""
+
+
+def size_notes(scale: float, rigid_rmse: float, similar_rmse: float, truth: Trajectory) -> Iterator[str]:
     """What is wrong with the unit of a metric path.
 
     Parameters
     ----------
     scale : of the similarity, truth over estimate
     rigid_rmse, similar_rmse : of the positions after the rigid motion, and after the similarity
+    truth : the true path. One that hardly moves says nothing of units: drifts are alike, whatever their size.
     """
-    if not 1.0 / ALIKE < scale < ALIKE and similar_rmse < 0.5 * rigid_rmse:
+    if not 1.0 / ALIKE < scale < ALIKE and similar_rmse < 0.5 * rigid_rmse and _extent(truth) > LEAST_ERROR_M:
         yield (
             f"the true path is {scale:.4g} times as large as the estimated one: in a metric map correct {DEPTH_SCALE}, "
             "the baseline of the stereo pair, or the unit of the poses that it was made with"
