@@ -109,6 +109,43 @@ def test_deviations_are_finite_differences_times_the_covariance():
     assert found.size_std == pytest.approx(float(np.sqrt(along @ covariance @ along)), rel=1e-6)
 
 
+def raised_strip_model():
+    """A strip whose nodes all rise by 0.1 m times the square of one parameter between -1 and 1: (T0 + T2) / 2."""
+    flat = rolled_strip_model(0.4)
+    field = np.zeros((2, len(flat.nodes), 3))
+    field[:, :, 2] = 0.05
+    functions = ParameterFunctions(-np.ones(1), np.ones(1), np.array([[0], [2]]), np.eye(2))
+    parameters = (Parameter("side", "ratio", "1", -1.0, 1.0, 0.0),)
+    return ReducedModel("raised", flat.nodes, flat.triangles, parameters, SeparatedField(field, functions))
+
+
+@pytest.mark.parametrize("place", [0.0, 0.3, -0.45])
+def test_an_unobservable_parameter_spreads_a_point_as_far_as_its_motion_is_curved(place):
+    """Draws one deviation to either side of a square have known moments; none where the derivative is zero."""
+    sigma = 0.52
+    model = raised_strip_model()
+    (found,) = run_of(model, [("end", (0.4, 0.0, 0.0))], in_frame(model, [place], sigma**2)).point_displacements()[
+        "end"
+    ]
+    draws = 0.1 * (place + sigma * np.array([-1.0, 1.0])) ** 2 - 0.1 * place**2
+    assert found.value[2] == pytest.approx(0.1 * place**2, abs=1e-12)
+    assert found.std == pytest.approx([0.0, 0.0, np.sqrt(np.mean(draws**2))], abs=1e-9)
+
+
+def test_steps_to_unobservable_values_end_with_the_range():
+    """From the upper end, a deviation of 3 down is beyond the lower one, where the height is the same again."""
+    model = raised_strip_model()
+    (found,) = run_of(model, [("end", (0.4, 0.0, 0.0))], in_frame(model, [1.0], 9.0)).point_displacements()["end"]
+    # Over the whole range the first derivative says -0.4 m, and the height does not change.
+    assert found.std[2] == pytest.approx(np.hypot(0.2 * 3.0, 0.4), rel=1e-9)
+
+
+def test_observable_parameters_keep_the_deviations_of_first_order():
+    model = raised_strip_model()
+    (found,) = run_of(model, [("end", (0.4, 0.0, 0.0))], in_frame(model, [0.3], 0.4**2)).point_displacements()["end"]
+    assert found.std[2] == pytest.approx(0.1 * 2.0 * 0.3 * 0.4, rel=1e-9)
+
+
 def test_a_discrepancy_widens_deviations_by_the_process():
     """A place far from all that was seen: displacements have the process's deviation, and turns that of its slope.
 

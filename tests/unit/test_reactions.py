@@ -1,5 +1,7 @@
 """Reactions of supports: fields of one point in a model, forces with deviations in a frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -127,3 +129,20 @@ def test_forces_of_undetermined_parameters_are_undetermined():
     top = Reactions(held_bar({}))(estimate_at(0.2, 0.3, np.full((2, 2), np.inf)))["top"]
     assert np.isposinf([*top.force.std, top.force.size_std, *top.moment.std]).all()
     assert top.force.value == pytest.approx([20.0, 0.0, 90.0])
+
+
+def test_forces_of_an_unobservable_parameter_spread_by_their_curvature():
+    """The force is 100 a^2 N along x and 300 b N along z, the moment about the support 50 a^2 N m: (T0 + T2) / 2."""
+    indices = np.array([[0, 0], [2, 0], [0, 1]])
+    functions = ParameterFunctions(-np.ones(2), np.ones(2), indices, np.eye(3))
+    force = np.array([[[50.0, 0, 0]], [[50.0, 0, 0]], [[0, 0, 300.0]]])
+    moment = np.array([[[0, 25.0, 0]], [[0, 25.0, 0]], [[0, 0, 0]]])
+    fields = {"force_top": SeparatedField(force, functions), "moment_top": SeparatedField(moment, functions)}
+    model = replace(held_bar({}), reactions=fields)
+    a, sigma = 0.1, 0.6
+    top = Reactions(model)(estimate_at(a, 0.2, np.diag([sigma**2, 4e-4])))["top"]
+    draws = (a + sigma * np.array([-1.0, 1.0])) ** 2 - a**2
+    spread = np.sqrt(np.mean(draws**2))
+    assert top.force.value == pytest.approx([1.0, 0.0, 60.0])
+    assert top.force.std == pytest.approx([100.0 * spread, 0.0, 6.0])
+    assert top.moment.std == pytest.approx([0.0, 50.0 * spread, 0.0])

@@ -7,7 +7,7 @@ covariance S C S' at each point, with its sensitivities S = dF/dmu and the param
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,6 +82,47 @@ def covariance_of_parameters(estimate: Estimate) -> Array:
     measured = estimate.measured_covariance
     covariance = (estimate.image_covariance if measured is None else measured)[:d, :d]
     return covariance if estimate.flat is None else covariance + np.diag(estimate.flat)
+
+
+def beyond_first_order(
+    value: Callable[[Array], Array], slopes: Array, mu: Array, covariance: Array, model: ReducedModel
+) -> Array:
+    """What the first derivatives miss of a field along unobservable directions, for one standard deviation.
+
+    Where a deviation is a good part of a range, the field is curved within it: at its turning point the derivatives say
+    that nothing changes. Squares of the rows are added to the variances that the derivatives give.
+
+    Parameters
+    ----------
+    value : the field (...) at parameters (d,).
+    slopes : (d, ...) its derivatives at ``mu``.
+    mu : (d,) parameters.
+    covariance : (d, d) of them, finite.
+    model : with the ranges, which no step leaves.
+
+    Returns
+    -------
+    (m, ...) of each unobservable principal direction the larger of both sides; m is 0 where all is observable.
+    """
+    low, high = np.minimum(model.lower, mu), np.maximum(model.upper, mu)
+    ranges = model.upper - model.lower
+    values, vectors = np.linalg.eigh(covariance / np.outer(ranges, ranges))
+    found, here = np.zeros((0, *slopes.shape[1:])), None
+    for k in np.flatnonzero(values >= UNOBSERVABLE_SHARE**2):
+        here = value(mu) if here is None else here
+        along = np.sqrt(values[k]) * vectors[:, k] * ranges
+        # Shortened as a whole: one parameter cut by itself would leave the direction in which images are the same.
+        steps = [_within(mu, sign * along, low, high) for sign in (-1.0, 1.0)]
+        missed = [value(mu + step) - here - np.tensordot(step, slopes, axes=1) for step in steps]
+        found = np.concatenate([found, max(missed, key=lambda one: float(np.sum(one**2)))[None]])
+    return found
+
+
+def _within(mu: Array, step: Array, low: Array, high: Array) -> Array:
+    """The step (d,) from ``mu``, shortened so that it ends in the box."""
+    room = np.where(step > 0.0, high - mu, mu - low)
+    moves = step != 0.0
+    return step * min(1.0, float(np.min(room[moves] / np.abs(step[moves]), initial=1.0)))
 
 
 def unobservable_in_run(

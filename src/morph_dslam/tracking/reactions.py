@@ -1,14 +1,16 @@
 """What supports, and unknown loads, exert on the object in a state, with standard deviations: forces from images.
 
 The reduced model holds force and moment of every support as functions of the parameters. Their deviations follow from
-those of the parameters to first order; a common factor by which all moduli may be off changes every force alike, and is
-added. Neither the error of the model nor that of its law is in them.
+those of the parameters to first order, and beyond it where a parameter is unobservable; a common factor by which all
+moduli may be off changes every force alike, and is added. Neither the error of the model nor that of its law is in
+them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE, MOMENT
 from morph_dslam.model.unknown_loads import LOADS, node_areas
 from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.observability import beyond_first_order
 
 Array = NDArray[np.float64]
 #: Unknown loads are where their traction is at least this part of its largest value.
@@ -82,6 +85,7 @@ class Reactions:
     def __init__(self, model: ReducedModel) -> None:
         names = [name.removeprefix(FORCE) for name in model.reactions if name.startswith(FORCE)]
         self._parts = {name: _fields_of(model, name) for name in names}
+        self._model = model
 
     def __call__(self, estimate: Estimate, modulus_std: float = 0.0) -> dict[str, Reaction]:
         """The reaction of each support, by the name of its set.
@@ -95,17 +99,21 @@ class Reactions:
         covariance = estimate.covariance[: len(mu), : len(mu)]
         known = np.isfinite(covariance).all()
 
-        def estimated(value: Array, slopes: Array) -> VectorEstimate:
-            of_parameters = slopes.T @ covariance @ slopes if known else np.full((3, 3), np.inf)
-            # A common factor of the moduli is one more parameter, by which the derivative is the value itself.
-            return VectorEstimate.of(value, of_parameters + modulus_std**2 * np.outer(value, value))
-
         found = {}
         for name, fields in self._parts.items():
             (point, arms), (force, forces), (about_origin, moments) = (field(mu) for field in fields)
-            moment = about_origin - np.cross(point, force)
             moment_slopes = moments - np.cross(arms, force) - np.cross(point, forces)
-            found[name] = Reaction(point, estimated(force, forces), estimated(moment, moment_slopes))
+            values = np.stack([force, about_origin - np.cross(point, force)])
+            slopes = np.stack([forces, moment_slopes], axis=1)
+            spread = np.full((2, 3, 3), np.inf)
+            if known:
+                of_name = partial(_force_and_moment, fields)
+                missed = beyond_first_order(of_name, slopes, mu, covariance, self._model)
+                spread = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes)
+                spread += np.einsum("mpx,mpy->pxy", missed, missed)
+            # A common factor of the moduli is one more parameter, by which the derivative is the value itself.
+            spread = spread + modulus_std**2 * np.einsum("px,py->pxy", values, values)
+            found[name] = Reaction(point, *map(VectorEstimate.of, values, spread))
         return found
 
     def forces(self, mu: Array) -> dict[str, tuple[Array, Array]]:
@@ -116,6 +124,12 @@ class Reactions:
     def names(self) -> list[str]:
         """Of the supports."""
         return list(self._parts)
+
+
+def _force_and_moment(fields: tuple[_Field, _Field, _Field], mu: Array) -> Array:
+    """Force of a support and moment about its point (2, 3) at parameters (d,)."""
+    point, force, about_origin = (field(mu)[0] for field in fields)
+    return np.stack([force, about_origin - np.cross(point, force)])
 
 
 def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:

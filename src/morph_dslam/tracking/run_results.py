@@ -14,7 +14,7 @@ from morph_dslam.model.discrepancy import Discrepancy, largest_deformation
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.named_points import NamedPoints
-from morph_dslam.tracking.observability import largest_displacement, largest_von_mises
+from morph_dslam.tracking.observability import beyond_first_order, largest_displacement, largest_von_mises
 from morph_dslam.tracking.outcomes import Status
 from morph_dslam.tracking.point_rotations import Surroundings
 from morph_dslam.tracking.reactions import Reaction, Reactions, VectorEstimate
@@ -155,7 +155,8 @@ class RunResults:
 
     def _displacements_of_points(self, estimate: Estimate, discrepancy: Discrepancy | None) -> list[VectorEstimate]:
         assert self.points is not None
-        values, slopes = self._field_of_points.value_and_sensitivities(estimate.state.parameters)
+        field, mu = self._field_of_points, estimate.state.parameters
+        values, slopes = field.value_and_sensitivities(mu)
         if discrepancy is not None:
             values = values + discrepancy.displacement(self.points.rest)
         d = len(slopes)
@@ -163,6 +164,8 @@ class RunResults:
         if not np.isfinite(covariance).all():
             return [VectorEstimate.of(value, np.full((3, 3), np.inf)) for value in values]
         of_points = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes, optimize=True)
+        for missed in beyond_first_order(field.value, slopes, mu, covariance, self.model):
+            of_points += missed[:, :, None] * missed[:, None, :]
         of_points += estimate.model_displacement_in_object**2 / 3.0 * np.eye(3)
         if discrepancy is not None:
             of_points += discrepancy.covariances(self.points.rest)
