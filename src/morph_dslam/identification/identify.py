@@ -290,8 +290,10 @@ class _Fit:
             raise IdentificationError(
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
             )
-        spread = self._spread(jacobian, self._residuals(theta), errors)
-        estimates = self._estimates(theta, spread, at_bound, self._alike(theta, jacobian, spread))
+        residuals = self._residuals(theta)
+        spread = self._spread(jacobian, residuals, errors)
+        alike = self._alike(theta, jacobian, float(residuals @ residuals), spread)
+        estimates = self._estimates(theta, spread, at_bound, alike)
         std = np.sqrt(np.diag(spread.covariance))
         products = np.outer(std, std)
         # What is fitted without any error has no deviation.
@@ -299,15 +301,14 @@ class _Fit:
         misfits = self._misfits(theta, jacobian[:, ~at_bound], errors)
         return Identification(estimates, correlation, misfits, spread.groups)
 
-    def _alike(self, theta: Array, jacobian: Array, spread: _Spread) -> Array:
-        """How far (k, 2) below and above each estimate its range has values that fit nearly as well.
+    def _alike(self, theta: Array, jacobian: Array, least: float, spread: _Spread) -> Array:
+        """How far (k, 2) below and above each estimate its range has values that fit nearly as well as ``least``.
 
-        What is told by a contact may be anything before it. There the sum of squares rises by less than the derivatives
-        say it does two standard deviations away.
+        The way of a body that does not touch yet may be anything up to the contact. There the sum of squares rises by
+        less than the derivatives say it does two standard deviations away.
         """
-        least, std = float(np.sum(self._residuals(theta) ** 2)), np.sqrt(np.diag(spread.covariance))
         found = np.zeros((len(theta), 2))
-        for i, away in enumerate(LOOK * std):
+        for i, away in enumerate(LOOK * np.sqrt(np.diag(spread.covariance))):
             rise = float(np.sum((away * jacobian[:, i]) ** 2))
             for value in np.linspace(0.0, 1.0, PLACES):
                 there = np.where(np.arange(len(theta)) == i, value, theta)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.model.parameter_errors import mean_products, surface_modes
 
 Array = NDArray[np.float64]
@@ -65,10 +66,13 @@ class FlatSides:
     Parameters
     ----------
     model : of the object.
+    errors : of the model, whose mean products of modes are taken where it has them; None where none are known.
     """
 
-    def __init__(self, model: ReducedModel) -> None:
-        self._functions, self._products = model.displacement.functions, mean_products(surface_modes(model))
+    def __init__(self, model: ReducedModel, errors: ModelErrors | None = None) -> None:
+        known = None if errors is None or errors.mesh is None else errors.mesh.products
+        self._products = mean_products(surface_modes(model)) if known is None else known
+        self._functions = model.displacement.functions
         self._lower, self._upper = model.lower, model.upper
         self._sought = range(len(model.parameters) - model.n_loads)
 

@@ -360,7 +360,7 @@ class RigTracker:
         self._filter = new_filter(self.estimator, self.options)
         self._errors = RigErrors(self.trackers, self.cameras)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
-        self._flat_sides = FlatSides(self.model)
+        self._flat_sides = FlatSides(self.model, self._model_errors)
         self._sigma_px = FIRST_SIGMA_PX
 
     @property

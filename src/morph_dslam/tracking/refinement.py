@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 
+from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
@@ -26,6 +27,8 @@ from morph_dslam.tracking.outline import OutlineMeasurement
 Array = NDArray[np.float64]
 #: Step of scaled unknowns that derivatives are differences over, on the way to a minimum and for its covariance.
 DIFFERENCE, WIDE = 1e-2, 0.3
+#: Scale of a parameter of the reference state, as a share of half its range.
+SHARE_OF_RANGE = 0.05
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,11 @@ def choose_keyframes(keyframes: Sequence[Keyframe], count: int = N_KEYFRAMES) ->
     return [keyframes[row] for row in rows] if len(keyframes) else []
 
 
+def reference_scale(model: ReducedModel) -> Array:
+    """Scale (d + 6,) of the unknowns of a reference state: parameters and pose, SI."""
+    return np.concatenate([SHARE_OF_RANGE * 0.5 * (model.upper - model.lower), np.full(3, 0.01), np.full(3, 0.005)])
+
+
 def refine_reference(
     estimator: Estimator,
     known: LandmarkTerm | StateTerm,
@@ -119,8 +127,7 @@ def refine_reference(
     inner = Estimator(model, camera, replace(estimator.options, max_iterations=8, tolerance=1e-5))
     inner.loads = estimator.loads
     d = len(model.parameters)
-    half_ranges = 0.5 * (model.upper - model.lower)
-    scale = np.concatenate([0.05 * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+    scale = reference_scale(model)
     free = np.r_[: d - model.n_loads, d : d + 6]
 
     def reference(step: Array) -> State:

@@ -301,14 +301,14 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
     return summary
 
 
-#: A force is at least its length less so many standard deviations; one that may be zero by that is not told from it.
+#: A force is at least its length less so many standard deviations; where that is not positive, it may be zero.
 CERTAIN = 2.0
 
 
 def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     """Of each support the force that is largest for certain, its standard deviation and frame; the largest one first.
 
-    Where none is told from zero it is the largest one with a finite deviation, as so much may have acted; supports of
+    Where none differs from zero it is the largest one with a finite deviation, as so much may have acted; supports of
     which that holds come last.
 
     The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
@@ -333,7 +333,7 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
 
 
 def _certainty(force: VectorEstimate) -> tuple[bool, bool, float]:
-    """Whether a force is told from zero and determined at all, and its size by that: a run's largest has the most."""
+    """Whether a force differs from zero, whether it is determined, and its size by that: the largest has the most."""
     least = force.size - CERTAIN * force.size_std
     if least > 0.0:
         return True, True, least

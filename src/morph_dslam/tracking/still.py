@@ -24,7 +24,15 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
-from morph_dslam.tracking.refinement import DIFFERENCE, EFFECTIVE_POINTS, Keyframe, differences, minimum
+from morph_dslam.tracking.refinement import (
+    DIFFERENCE,
+    EFFECTIVE_POINTS,
+    SHARE_OF_RANGE,
+    Keyframe,
+    differences,
+    minimum,
+    reference_scale,
+)
 from morph_dslam.tracking.state import Prior, pose_increment
 
 Array = NDArray[np.float64]
@@ -37,8 +45,6 @@ TERM_STD: dict[CameraTerm, float] = {"focal": 0.3, "radial": 0.05}
 LEAST_SIGMA_PX = 0.3
 #: Rounds with weights by the residuals of the round before; steps of a keyframe's own parameters.
 ROUNDS, STEPS = 2, 6
-#: Scale of a parameter of the reference state, as a share of half its range.
-SHARE_OF_RANGE = 0.05
 #: The least information of a keyframe's own parameter that counts, as a share of that of all.
 LEAST_SEEN = 1e-9
 #: Unknowns closer than this, scaled, are the same minimum; twice the log-likelihood ratio that excludes another one.
@@ -107,8 +113,7 @@ class StillProblem:
         self._model, self._camera, self._start, self._known = model, camera, start, known
         self._constant, self._terms, d = list(constant), tuple(terms), len(model.parameters)
         self._free = np.setdiff1d(np.arange(d), self._constant)
-        half_ranges = 0.5 * (model.upper - model.lower)
-        self._scale = np.concatenate([SHARE_OF_RANGE * half_ranges, np.full(3, 0.01), np.full(3, 0.005)])
+        self._scale = reference_scale(model)
         self._columns = np.setdiff1d(np.arange(d + 6), known_at_first)
         # As recorded, so that another lens can undistort them.
         self._reference = camera.distort_pixels(reference_pixels)

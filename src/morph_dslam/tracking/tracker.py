@@ -159,7 +159,7 @@ class Tracker:
         check_pose(self.options, registration, in_map)
         self.estimator = Estimator(self.model, camera, self.options.estimation)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
-        self._flat_sides = FlatSides(self.model)
+        self._flat_sides = FlatSides(self.model, self._model_errors)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
         use, sought = self.options.use_discrepancy, self.options.discrepancy
