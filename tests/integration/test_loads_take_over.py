@@ -12,7 +12,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.model.unknown_loads import with_unknown_loads
-from morph_dslam.registration.landmarks import shape_starts
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.anchoring import points_on_object
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State
 from morph_dslam.tracking.frame_estimation import FrameEstimation

@@ -15,14 +15,16 @@ from morph_dslam.errors import ArgumentError, RegistrationError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_rig
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import MissingFrame
 from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
 from morph_dslam.tracking.outcomes import RejectionReason, SamePlace
+from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.session import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
@@ -407,6 +409,36 @@ def test_the_command_tracks_with_both_cameras(model, rig_recording_of_sheet, tmp
         *with_both_cameras(folder, tmp_path / "again", "--with", folder / "aside")
     )
     assert "camchain.yaml#cam1" in refused(*with_both_cameras(folder, tmp_path / "again", camera="camchain.yaml#cam1"))
+
+
+def write_noisy_landmarks(path, model, part, seed):
+    """16 nodes of the sheet where a camera of the rig sees them in the first frame, half a pixel off."""
+    rng, state = np.random.default_rng(seed), part.seen(sheet_state(0.0))
+    nodes = rng.choice(len(model.nodes), 16, replace=False)
+    pixels = part.camera.project(state.camera_from_object.apply(model.positions(state.parameters)[nodes]))
+    save_landmarks(path, Landmarks(model.nodes[nodes], pixels + 0.5 * rng.standard_normal(pixels.shape)))
+
+
+def test_landmarks_in_both_cameras_place_the_sheet_better(model, rig_recording_of_sheet, tmp_path, refused):
+    """The truth is that of the film."""
+    folder, off, deviation = rig_recording_of_sheet, {}, {}
+    for number, part in enumerate(RIG):
+        write_noisy_landmarks(tmp_path / f"{number}.csv", model, part, number)
+    for name, more in (("one", []), ("both", ["--with-landmarks", tmp_path / "1.csv"])):
+        arguments = [*with_both_cameras(folder, tmp_path / name, *more), "--no-video"]
+        arguments[arguments.index("--landmarks") + 1] = tmp_path / "0.csv"
+        assert run_command(arguments) == 0
+        run, off[name] = load_run(tmp_path / name), []
+        for row, time in enumerate([0.0, *RIG_TIMES[:4]]):
+            state = sheet_state(time)
+            exact = state.camera_from_object.apply(model.positions(state.parameters))
+            off[name].append(np.linalg.norm(run.camera_points(row) - exact, axis=1).mean())
+        deviation[name] = np.sqrt(np.median(run.covariances[:, -1, -1]))
+    assert np.mean(off["both"]) < 0.6 * np.mean(off["one"])
+    assert deviation["both"] < 0.5 * deviation["one"]
+    assert "name the recording of each further camera" in refused(
+        *with_both_cameras(folder, tmp_path / "again", "--with-landmarks", "1.csv", "--with-landmarks", "2.csv")
+    )
 
 
 def test_cameras_that_do_not_agree_are_named_and_one_recording_twice_is_refused(

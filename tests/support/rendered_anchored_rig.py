@@ -24,7 +24,7 @@ from morph_dslam.render.scene_file import Scene, load_scene_file
 from morph_dslam.render.scene_renderer import Instant, SceneRenderer, supersampled
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.slam import Slam
-from morph_dslam.tracking.multi_camera import RigCamera
+from morph_dslam.tracking.rig import RigCamera
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_anchored import write_registration
 from tests.support.staged_scenes import bending_wedge

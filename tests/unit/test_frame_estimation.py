@@ -8,8 +8,8 @@ import pytest
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model.revolution import with_revolution_angle
-from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import PosePrior
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, State
 from morph_dslam.tracking.frame_estimation import (
     ShapeSearch,

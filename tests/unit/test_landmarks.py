@@ -8,7 +8,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
-from morph_dslam.registration.landmarks import register_landmarks, shape_starts, solve_pnp
+from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -18,6 +18,7 @@ from morph_dslam.registration.messages import (
     PoorFit,
     Underdetermined,
 )
+from morph_dslam.registration.starts import shape_starts, solve_pnp
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points

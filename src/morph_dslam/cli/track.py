@@ -41,6 +41,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "FRAMES",
         Path,
     )
+    add_repeated(
+        groups.start,
+        "--with-landmarks",
+        "landmarks in what the next camera of the rig saw in the reference frame, in the order of --with",
+        "LANDMARKS",
+        Path,
+    )
     groups.start.add_argument(
         "--reference-frame",
         type=int,
@@ -80,6 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
         refine_reference=arguments.refine,
         refine_camera=tuple(dict.fromkeys(arguments.refine_camera)),
         other_cameras=tuple(vars(arguments)["with"]),  # a keyword of the language
+        other_landmarks=tuple(arguments.with_landmarks),
     )
     track_and_print(options)
 

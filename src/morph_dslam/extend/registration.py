@@ -20,3 +20,4 @@ from morph_dslam.registration.register import (
     registration_line as registration_line,
     run_registration as run_registration,
 )
+from morph_dslam.tracking.rig import RigCamera as RigCamera

@@ -16,7 +16,6 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, cross_matrix
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.board import FEWEST_CORNERS, FiducialBoard, load_board
-from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, AssumedUndeformed, RegistrationWarning
 from morph_dslam.registration.registration import (
     KeyframePose,
@@ -26,6 +25,7 @@ from morph_dslam.registration.registration import (
     state_covariance,
 )
 from morph_dslam.registration.scene import View, camera_from_object, points_and_views
+from morph_dslam.registration.starts import solve_pnp
 from morph_dslam.registration.texture import moved_similarity, pose_jacobian
 from morph_dslam.slam.scene import Scene
 from morph_dslam.tracking.state import State, moved

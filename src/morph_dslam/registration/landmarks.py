@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import permutations, product
+from itertools import permutations
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import RegistrationError, RegistrationFailure, check_kind
-from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFailure, check_kind
+from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.initialization import undistorted_grey
@@ -29,6 +27,7 @@ from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
     AtBound,
+    CamerasContradict,
     DepthAgainstLandmarks,
     FewLandmarks,
     NotAtRest,
@@ -42,11 +41,13 @@ from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinc
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
+from morph_dslam.registration.starts import pose_starts, shape_starts
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SIGMA_AT_1M
 from morph_dslam.tracking.depth_registration import refine_by_depth
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, State
+from morph_dslam.tracking.rig import PointsEstimator, RigCamera
 
 Array = NDArray[np.float64]
 #: Standard deviation of a carefully set landmark, pixels. Those that fit so many times worse, and worse than this share
@@ -62,6 +63,8 @@ SPREAD_SHARE, SURFACE_SHARE = 0.12, 0.01
 RESIDUAL_SHARE = 0.005
 #: Both of hints about an object whose edges give its place in the end: they need not be exact, but no mistakes.
 HINT_RESIDUAL_SHARE, HINT_SURFACE_SHARE = 0.02, 0.05
+#: Cameras disagree whose landmarks fit by themselves to this share of how they fit together.
+ALONE_SHARE = 0.5
 #: With fewer numbers to spare, residuals show the error of landmarks to a third at best.
 ENOUGH_SPARE = 6
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
@@ -83,6 +86,7 @@ def register_landmarks(
     at_rest: bool = False,
     near: State | None = None,
     image: NDArray[np.uint8] | None = None,
+    others: Sequence[tuple[RigCamera, Landmarks]] = (),
 ) -> Registration:
     """The object in the frame in which the landmarks were set.
 
@@ -100,6 +104,8 @@ def register_landmarks(
         minimum elsewhere nor an ambiguity.
     image : the frame as recorded, (h, w, 3) or (h, w), in which the object's outline corrects the landmarks
         (`outline_snap`); None to rely on them alone. Depth decides instead where there is any.
+    others : further cameras fixed to ``camera``, each (``RigCamera`` of `morph_dslam.extend.registration`) with the
+        landmarks in what it saw at the same instant. All count together; depth and image correct those of one camera.
 
     Raises
     ------
@@ -107,7 +113,7 @@ def register_landmarks(
         If there are fewer than 4 landmarks, one lies off the object or outside the image, or no pose and
         parameters explain them.
     ArgumentError
-        If model, camera or landmarks are of another kind.
+        If model, camera or landmarks are of another kind, or depth or image is given beside others.
     CameraError
         If image or depth is not of the camera's size, or of another type.
     """
@@ -119,24 +125,29 @@ def register_landmarks(
         "landmarks",
         "Landmarks(points, pixels) of morph_dslam.extend.registration, or the path of a file that has them",
     )
+    if others and not (depth is None and image is None):
+        raise ArgumentError("depth and image correct the landmarks of one camera: leave out these, or others")
     announce_compilation()
     if not isinstance(landmarks, Landmarks):
         landmarks = load_landmarks(Path(landmarks))
-    bound = bind_landmarks(model, landmarks.points)
-    check_pixels(camera, landmarks)
-    pixels = np.ascontiguousarray(camera.undistort_pixels(landmarks.pixels))
-    estimator = _estimator(model, camera, at_rest)
+    cameras, given = [RigCamera(camera, RigidTransform.identity())], [landmarks]
+    for part, seen in others:
+        cameras.append(part)
+        given.append(seen)
+    bound, pixels, of_points = _joined(model, cameras, given)
+    names = _names(of_points)
+    estimator = _estimator(model, cameras, of_points, at_rest)
     shapes = shape_starts(model)
     if at_rest or 2 * len(bound) < len(model.parameters) + 6:
         # Too few landmarks leave the shape at its default; the damped iteration departs no more than it must.
         shapes = [model.default]
-    starts = list(_starts(shapes, camera, bound, pixels)) if near is None else [near]
+    starts = list(pose_starts(shapes, estimator, bound, pixels)) if near is None else [near]
     found = _estimates(estimator, bound, pixels, starts)
     if at_rest:
         found = [_of_pose_alone(estimator, bound, pixels, estimate) for estimate in found]
     best, alternatives = _distinct_minima(model, found, click_px)
     rms, diagonal = _rms(best), float(np.hypot(camera.width, camera.height))
-    _check_residual(estimator, bound, pixels, best, np.arange(len(bound)) + 1)
+    _check_residual(estimator, bound, pixels, best, names)
     facts = {
         "from": "landmarks",
         "residual_rms_px": rms,
@@ -147,9 +158,9 @@ def register_landmarks(
     poor_px = max(POOR_FIT * click_px, POOR_SHARE * diagonal)
     moved = None
     if at_rest:
-        others = _starts(shape_starts(model) if near is None else [], camera, bound, pixels)
+        further = pose_starts(shape_starts(model) if near is None else [], estimator, bound, pixels)
         least_share = 0.0 if best.sigma_px > poor_px else MOVED_SHARE
-        moved = not_at_rest(estimator, bound, pixels, best, others, click_px, least_share)
+        moved = not_at_rest(estimator, bound, pixels, best, further, click_px, least_share)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
     covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
     variance, normals = max(click_px, best.sigma_px) ** 2, np.zeros_like(pixels)
@@ -177,8 +188,12 @@ def register_landmarks(
         aids = "depth images" if image is not None else "depth images, the outline (--snap)"
         notes = (*notes, *measured.notes(best.state, linear, covariance, aids))
     alone_px = facts["sigma_px"] if depth is not None else np.nan
-    warnings = _warnings(model, best, len(alternatives), landmarks.points, click_px, poor_px, moved, alone_px)
-    warnings = (*warnings, *notes, *turned_away(model, best.state, landmarks.points))
+    warnings = _warnings(model, best, len(alternatives), bound.rest, click_px, poor_px, moved, alone_px)
+    if best.sigma_px > poor_px and (contradiction := list(_disagreeing(estimator, bound, pixels, best))):
+        warnings = (*contradiction, *(warning for warning in warnings if not isinstance(warning, PoorFit)))
+    warnings = (*warnings, *notes)
+    for part, seen in zip(cameras, given, strict=True):
+        warnings = (*warnings, *turned_away(model, part.seen(best.state), seen.points))
     return Registration(model, best.state, covariance, facts=facts, warnings=warnings, alternatives=alternatives)
 
 
@@ -192,6 +207,39 @@ def bind_landmarks(model: ReducedModel, points: Array) -> BoundPoints:
     surface = on_surface(model, points)
     check_spread(model, points)
     return BoundPoints.from_surface(model, surface)
+
+
+def _joined(
+    model: ReducedModel, cameras: Sequence[RigCamera], given: Sequence[Landmarks]
+) -> tuple[BoundPoints, Array, NDArray[np.int64]]:
+    """The landmarks of all cameras, those of the first one first.
+
+    Returns
+    -------
+    points : k of them, bound.
+    pixels : (k, 2) undistorted.
+    of_points : (k,) number of the camera that saw each.
+    """
+    bound = bind_landmarks(model, given[0].points)
+    check_pixels(cameras[0].camera, given[0])
+    pixels = [cameras[0].camera.undistort_pixels(given[0].pixels)]
+    for number, (part, seen) in enumerate(zip(cameras[1:], given[1:], strict=True), start=1):
+        try:
+            bound = bound.joined(BoundPoints.from_surface(model, on_surface(model, seen.points)))
+            check_pixels(part.camera, seen)
+        except RegistrationError as error:
+            raise RegistrationError(f"camera {number}: {error}") from error
+        pixels.append(part.camera.undistort_pixels(seen.pixels))
+    of_points = np.repeat(np.arange(len(cameras)), [len(part) for part in pixels])
+    return bound, np.ascontiguousarray(np.concatenate(pixels)), of_points
+
+
+def _names(of_points: NDArray[np.int64]) -> list[str]:
+    """What messages call landmarks (k,) of these cameras: their place in their file."""
+    places = [int(np.count_nonzero(of_points[:row] == number)) + 1 for row, number in enumerate(of_points)]
+    return [
+        f"{place} of camera {number}" if number else f"{place}" for place, number in zip(places, of_points, strict=True)
+    ]
 
 
 def check_at_rest(
@@ -208,10 +256,10 @@ def check_at_rest(
     numbers : (k,) theirs in the messages.
     """
     bound = BoundPoints.from_surface(model, surface)
-    starts = list(_starts([model.default], camera, bound, pixels))
-    estimator = _estimator(model, camera, at_rest=True)
-    best = _estimates(estimator, bound, pixels, starts)[0]
-    _check_residual(estimator, bound, pixels, best, numbers, HINT_RESIDUAL_SHARE)
+    cameras, of_points = [RigCamera(camera, RigidTransform.identity())], np.zeros(len(bound), dtype=np.int64)
+    estimator = _estimator(model, cameras, of_points, at_rest=True)
+    best = _estimates(estimator, bound, pixels, list(pose_starts([model.default], estimator, bound, pixels)))[0]
+    _check_residual(estimator, bound, pixels, best, [str(number) for number in numbers], HINT_RESIDUAL_SHARE)
 
 
 def on_surface(model: ReducedModel, points: Array, share: float = SURFACE_SHARE) -> SurfacePoints:
@@ -281,8 +329,10 @@ def check_pixels(camera: Camera, landmarks: Landmarks) -> None:
         )
 
 
-def _estimator(model: ReducedModel, camera: Camera, at_rest: bool) -> Estimator:
-    estimator = Estimator(model, camera, EstimationOptions(huber_px=3.0, max_iterations=60))
+def _estimator(
+    model: ReducedModel, cameras: Sequence[RigCamera], of_points: NDArray[np.int64], at_rest: bool
+) -> PointsEstimator:
+    estimator = PointsEstimator(model, cameras, of_points, EstimationOptions(huber_px=3.0, max_iterations=60))
     if at_rest:
         estimator.box = replace(estimator.box, lower=model.default, upper=model.default)
     return estimator
@@ -298,29 +348,6 @@ def _estimates(estimator: Estimator, bound: BoundPoints, pixels: Array, starts: 
             RegistrationFailure.LANDMARKS_DO_NOT_FIT,
         )
     return found
-
-
-def shape_starts(model: ReducedModel, largest: int = 243) -> list[Array]:
-    """Parameters (d,) to start from: the default, then a coarse grid over the box.
-
-    Each range is cut at 1/6, 1/2 and 5/6; when that makes more than ``largest`` shapes, one parameter at a
-    time leaves its default. Unknown loads are zero in all of them.
-    """
-    if model.n_loads:
-        none = np.zeros(model.n_loads)
-        return [np.concatenate([shape, none]) for shape in shape_starts(model.without_loads, largest)]
-    shares = (1 / 6, 1 / 2, 5 / 6)
-    lower, upper, default = model.lower, model.upper, model.default
-    d = len(lower)
-    if len(shares) ** d < largest + 1:
-        grid = [lower + np.array(choice) * (upper - lower) for choice in product(shares, repeat=d)]
-    else:
-        grid = []
-        for k, share in product(range(d), (shares[0], shares[-1])):
-            shape = default.copy()
-            shape[k] = lower[k] + share * (upper[k] - lower[k])
-            grid.append(shape)
-    return [default, *grid]
 
 
 def _of_pose_alone(estimator: Estimator, bound: BoundPoints, pixels: Array, found: Estimate) -> Estimate:
@@ -341,48 +368,6 @@ def _without_parameters(covariance: Array) -> Array:
     return known
 
 
-def _starts(shapes: list[Array], camera: Camera, bound: BoundPoints, pixels: Array) -> Iterator[State]:
-    """PnP poses of every start shape."""
-    for parameters in shapes:
-        for pose in solve_pnp(bound.rest + bound.field.value(parameters), pixels, camera):
-            yield State(parameters, pose)
-
-
-def solve_pnp(points: Array, pixels: Array, camera: Camera) -> list[RigidTransform]:
-    """Poses (camera from object) that put points (k, 3) in front of the camera near their pixels (k, 2).
-
-    SQPNP (Terzakis & Lourakis 2020) for any shape, and both poses of IPPE (Collins & Bartoli 2014) where the
-    points lie in a plane; of three points up to four poses by P3P (Ding et al., Revisiting the P3P problem, 2023, as in
-    OpenCV).
-    """
-    if len(points) == 3:
-        pixels = np.ascontiguousarray(pixels)
-        _, rotations, translations = cv2.solveP3P(points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_P3P)
-        return _in_front(points, rotations, translations)
-    centred = points - points.mean(axis=0)
-    spread = np.linalg.svd(centred, compute_uv=False)
-    methods = [cv2.SOLVEPNP_SQPNP]
-    if spread[2] < 1e-6 * spread[0]:
-        methods.append(cv2.SOLVEPNP_IPPE)
-    poses = []
-    for method in methods:
-        try:
-            _, rotations, translations, _ = cv2.solvePnPGeneric(points, pixels, camera.matrix, None, flags=method)
-        except cv2.error:
-            continue  # a degenerate configuration for this method; the others decide
-        poses += _in_front(points, rotations, translations)
-    return poses
-
-
-def _in_front(points: Array, rotations: Sequence[Any], translations: Sequence[Any]) -> list[RigidTransform]:
-    """OpenCV's poses as transforms, those that have all points in front of the camera."""
-    poses = [
-        RigidTransform(rotation_exp(np.asarray(r, dtype=float).ravel()), np.asarray(t, dtype=float).ravel())
-        for r, t in zip(rotations, translations, strict=True)
-    ]
-    return [pose for pose in poses if (pose.apply(points)[:, 2] > 0.0).all()]
-
-
 def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, tuple[State, ...]]:
     """The best minimum, and different ones that landmarks of the stated accuracy cannot exclude."""
     best = found[0]
@@ -399,24 +384,26 @@ def _rms(estimate: Estimate) -> float:
 
 
 def _check_residual(
-    estimator: Estimator,
+    estimator: PointsEstimator,
     bound: BoundPoints,
     pixels: Array,
     best: Estimate,
-    numbers: NDArray[np.int64],
+    names: Sequence[str],
     share: float = RESIDUAL_SHARE,
 ) -> None:
-    """Refuse landmarks (k,), which have these numbers, if they do not fit to a share of the image's diagonal."""
+    """Refuse landmarks (k,), which have these names, if they do not fit to a share of the image's diagonal."""
     camera = estimator.camera
     rms, limit = _rms(best), share * float(np.hypot(camera.width, camera.height))
     if rms <= limit:
         return
+    for disagreement in _disagreeing(estimator, bound, pixels, best):
+        raise RegistrationError(str(disagreement), RegistrationFailure.LANDMARKS_DO_NOT_FIT)
     is_shape_known = np.array_equal(estimator.box.lower, estimator.box.upper)
     wrong = _contradicted(estimator, bound, pixels, limit) if is_shape_known else None
     if wrong is not None:
         row, away, agreeing = wrong
         raise RegistrationError(
-            f"landmark {numbers[row]} is {away:.1f} px from where the other {len(bound) - 1} have it, which fit the "
+            f"landmark {names[row]} is {away:.1f} px from where the other {len(bound) - 1} have it, which fit the "
             f"object to {agreeing:.1f} px (at most {limit:.1f} px): check its point and its pixel",
             RegistrationFailure.LANDMARKS_DO_NOT_FIT,
         )
@@ -426,14 +413,36 @@ def _check_residual(
     more = "; five or more show which of them is wrong" if is_shape_known and len(bound) == FEWEST_FOR_FIT else ""
     raise RegistrationError(
         f"the landmarks do not fit the object: their residual is {rms:.1f} px (root mean square, at most "
-        f"{limit:.1f} px), the worst is landmark {numbers[worst]} with {lengths[worst]:.1f} px; check "
+        f"{limit:.1f} px), the worst is landmark {names[worst]} with {lengths[worst]:.1f} px; check "
         f"its pixel, the order of the landmarks, the camera file, and that {shape}{more}",
         RegistrationFailure.LANDMARKS_DO_NOT_FIT,
     )
 
 
+def _disagreeing(
+    estimator: PointsEstimator, bound: BoundPoints, pixels: Array, together: Estimate
+) -> Iterator[CamerasContradict]:
+    """That landmarks of each camera fit the object well by themselves, but not ``together``."""
+    if len(estimator.cameras) == 1:
+        return
+    box, worst = estimator.box, 0.0
+    shapes = [
+        together.state.parameters,
+        *([] if np.array_equal(box.lower, box.upper) else shape_starts(estimator.model)),
+    ]
+    for number in np.unique(estimator.of_points):
+        rows = np.flatnonzero(estimator.of_points == number)
+        if len(rows) < FEWEST_FOR_FIT:
+            continue
+        alone, points, seen = estimator.taking(rows), bound.take(rows), np.ascontiguousarray(pixels[rows])
+        starts = [together.state, *pose_starts(shapes, alone, points, seen)]
+        worst = max(worst, _rms(alone.estimate_from(points, seen, np.ones(len(rows)), starts)[0]))
+    if worst < ALONE_SHARE * _rms(together):
+        yield CamerasContradict(worst, _rms(together))
+
+
 def _contradicted(
-    estimator: Estimator, bound: BoundPoints, pixels: Array, limit: float
+    estimator: PointsEstimator, bound: BoundPoints, pixels: Array, limit: float
 ) -> tuple[int, float, float] | None:
     """The landmark without which the others fit an object of known shape to the limit; None if there is none.
 
@@ -447,9 +456,10 @@ def _contradicted(
     for row in range(len(bound)):
         others = np.delete(np.arange(len(bound)), row)
         kept, seen = bound.take(others), np.ascontiguousarray(pixels[others])
-        starts = list(_starts([estimator.model.default], estimator.camera, kept, seen))
-        for estimate in estimator.estimate_from(kept, seen, np.ones(len(kept)), starts)[:1]:
-            there = estimator.camera.project(bound.in_camera(estimate.state))[row]
+        fewer = estimator.taking(others)
+        starts = list(pose_starts([estimator.model.default], fewer, kept, seen))
+        for estimate in fewer.estimate_from(kept, seen, np.ones(len(kept)), starts)[:1]:
+            there = estimator.pixels(bound, estimate.state)[row]
             found.append((_rms(estimate), row, float(np.linalg.norm(pixels[row] - there))))
     agreeing, row, away = min(found, default=(np.inf, 0, 0.0))
     return (row, away, agreeing) if agreeing <= limit else None

@@ -141,6 +141,25 @@ class DepthAgainstLandmarks(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class CamerasContradict(RegistrationWarning):
+    """The landmarks of each camera of a rig fit the object by themselves, and not all together.
+
+    Attributes
+    ----------
+    alone_px : root mean square of the residuals of the camera that is worst by itself.
+    together_px : the same of all together.
+    """
+
+    template: ClassVar[str] = (
+        "the cameras contradict each other: their landmarks fit the object to {alone_px:.2g} px by themselves, and to "
+        "{together_px:.2g} px together. Check the poses of the cameras in the camchain, the order of the files, and "
+        "that the pictures are of one instant; until then places are off by more than stated"
+    )
+    alone_px: float
+    together_px: float
+
+
+@dataclass(frozen=True)
 class FewLandmarks(RegistrationWarning):
     """The landmarks are hardly more than the unknowns, so that their residuals do not show how exact they are.
 

@@ -16,9 +16,10 @@ from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.sections import Section, read_sections
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.initialization import Vector
-from morph_dslam.registration.landmarks import register_landmarks, shape_starts
+from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.registration.registration import Registration
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources.frames import read_image
 from morph_dslam.tracking.binding import nearest_surface_points

@@ -96,13 +96,11 @@ class MeasuredPoints:
 
     def _followed(self, best: State, values: Array, k: int) -> Iterator[tuple[Array, float]]:
         """Steps (d + 6,) from the estimate to the likeliest state with each value of parameter k, and their costs."""
-        held, box = Estimator(self.estimator.model, self.estimator.camera, self.estimator.options), self.estimator.box
-        state = best
+        box, state = self.estimator.box, best
         for value in values:
             lower, upper = box.lower.copy(), box.upper.copy()
             lower[k] = upper[k] = value
-            held.box = replace(box, lower=lower, upper=upper)
-            found = held.minimum(*self.at(state))
+            found = self.estimator.within(replace(box, lower=lower, upper=upper)).minimum(*self.at(state))
             state = found.state
             increment = pose_increment(best.camera_from_object, state.camera_from_object)
             yield np.concatenate([state.parameters - best.parameters, increment]), found.cost

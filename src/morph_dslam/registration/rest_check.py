@@ -49,10 +49,9 @@ def not_at_rest(
     # The largest F, of free parameters that explain all of it, spares most fits the search.
     if not d or freedom < 1 or fdtrc(d, freedom, 2.0 * resting.cost / (d * click_px**2)) > REST_CHANCE:
         return None
-    free = Estimator(model, estimator.camera, estimator.options)
     lower, upper = estimator.box.lower.copy(), estimator.box.upper.copy()
     lower[:d], upper[:d] = model.lower[:d], model.upper[:d]
-    free.box = replace(estimator.box, lower=lower, upper=upper)
+    free = estimator.within(replace(estimator.box, lower=lower, upper=upper))
     found = free.estimate_from(bound, pixels, np.ones(len(bound)), [resting.state, *others])
     best = next((estimate for estimate in found if np.isfinite(estimate.residuals).all()), resting)
     ratio = (resting.cost - best.cost) / max(best.cost, freedom * click_px**2 / 2.0) * freedom / d

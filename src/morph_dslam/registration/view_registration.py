@@ -24,12 +24,12 @@ from morph_dslam.registration.dense_points import DEPTH_NOISE, PointsOnSurface, 
 from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, Sighting
 from morph_dslam.registration.hints import NO_HINTS, GuessedPose, Hints
 from morph_dslam.registration.icp import Surface, same_place
-from morph_dslam.registration.landmarks import solve_pnp
 from morph_dslam.registration.mesh_edges import MeshEdges
 from morph_dslam.registration.other_views import AskedView, gains_in
 from morph_dslam.registration.point_evidence import PointEvidence, gather_evidence
 from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, camera_from_object, spread_views, views_of
 from morph_dslam.registration.search_space import on_large_planes
+from morph_dslam.registration.starts import solve_pnp
 from morph_dslam.registration.view_search import (
     EdgeDrawings,
     InView,

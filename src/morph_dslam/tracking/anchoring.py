@@ -20,8 +20,8 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.reduced_model import spread_over
-from morph_dslam.registration.landmarks import shape_starts
 from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.rolling_shutter import MiddleRowPoses

@@ -74,6 +74,19 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "several cameras are tracked from recordings: leave out --with, or use `morph track`",
     ),
     (
+        lambda run: len(run.other_landmarks) > len(run.other_cameras),
+        "landmarks of more cameras than there are: name the recording of each further camera, --with",
+    ),
+    (
+        lambda run: bool(run.other_landmarks) and run.landmarks is None,
+        "landmarks of further cameras count beside those of the first one: give --landmarks, or leave out "
+        "--with-landmarks",
+    ),
+    (
+        lambda run: bool(run.other_landmarks) and run.snap,
+        "the outline corrects the landmarks of one camera: leave out --snap or --with-landmarks",
+    ),
+    (
         lambda run: run.live and run.refine_reference,
         "a reference is refined over a whole recording: leave out --refine, or use `morph track`",
     ),

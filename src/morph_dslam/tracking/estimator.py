@@ -6,8 +6,10 @@ The unknowns are stacked as [parameters (d), rotation vector (3), translation (3
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -226,6 +228,26 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance)[len(self.state.parameters) :])
 
 
+def pixel_terms(
+    camera: Camera, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array, huber_px: float
+) -> tuple[float, Array, Array, Array]:
+    """Cost, Hessian (d + 6, d + 6), gradient (d + 6,) and residuals (p, 2) of pixels; see `reprojection.linearise`.
+
+    Parameters
+    ----------
+    camera : that saw the points.
+    points : p of them.
+    pixels, weights, normals : (p, 2), (p,) and (p, 2), as of `Estimator.evaluate`.
+    state : of the object.
+    huber_px : residual length where Huber's cost turns linear.
+    """
+    pose = state.camera_from_object
+    return linearise(
+        points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
+        points.field.modes, camera.intrinsics, pixels, weights, normals, huber_px,
+    )  # fmt: skip
+
+
 class Estimator:
     """Finds states from pixels of bound points, with one camera and one model."""
 
@@ -270,12 +292,8 @@ class Estimator:
         -------
         Cost in squared pixels, Hessian (d + 6, d + 6), gradient (d + 6,), residuals (p, 2).
         """
-        pose = state.camera_from_object
         normals = np.zeros_like(pixels) if normals is None else normals
-        cost, hessian, gradient, residuals = linearise(
-            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, self.camera.intrinsics, pixels, weights, normals, self.options.huber_px,
-        )  # fmt: skip
+        cost, hessian, gradient, residuals = self.of_pixels(points, pixels, weights, state, normals)
         others = [] if prior is None else [prior.terms(state)]
         if depths is not None:
             others.append(depths.terms(points, state)[:3])
@@ -292,6 +310,18 @@ class Estimator:
             hessian[rows, rows] += information
             gradient[rows] += push
         return cost, hessian, gradient, residuals
+
+    def of_pixels(
+        self, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array
+    ) -> tuple[float, Array, Array, Array]:
+        """What `evaluate` gives of the pixels alone."""
+        return pixel_terms(self.camera, points, pixels, weights, state, normals, self.options.huber_px)
+
+    def within(self, box: Box) -> Self:
+        """The same, whose parameters stay in another box."""
+        found = copy(self)
+        found.box = box
+        return found
 
     def estimate(
         self,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.registration.landmarks import shape_starts
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.timing import stage
 from morph_dslam.tracking.compact_loads import LEAST_GAIN
 from morph_dslam.tracking.covariance import trace_of_share

@@ -24,9 +24,10 @@ from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.known_values import registered_with
-from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import drawn_depth
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.setup import TrackedObject
@@ -203,7 +204,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     frames = frames_at(number)
     where = f"frame {frames[0].index} of {run.frames}" if run.reference_image is None else str(run.reference_image)
     camera.check_image(frames[0].image, where)
-    registration, images = part.register(camera, frames[0]), tuple(frame.image for frame in frames)
+    registration, images = part.register(cameras, frames[0]), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and number in (None, run.first)
     placed = with_loads(registration, part.options)

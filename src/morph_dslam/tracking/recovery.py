@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.landmarks import shape_starts, solve_pnp
+from morph_dslam.registration.starts import shape_starts, solve_pnp
 from morph_dslam.timing import stage
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, agree, reject

@@ -60,6 +60,8 @@ class TrackOptions(ObjectOptions):
     output : run folder of the first object; those of the others are in it.
     others : more objects, each with the name of its folder.
     other_cameras : recordings of the other cameras of the camchain, in its order, with the same frame numbers.
+    other_landmarks : of the first object in the reference frames of those cameras, in the same order, of as many as
+        have any.
     map_path : map that the objects are registered in; by default the one that each registration names.
     first : number of the first frame to track; by default that of the recording, or of the registration.
     last : number of the last frame to track; by default that of the recording.
@@ -87,6 +89,7 @@ class TrackOptions(ObjectOptions):
     output: Path
     others: tuple[tuple[str, ObjectOptions], ...] = ()
     other_cameras: tuple[Path, ...] = ()
+    other_landmarks: tuple[Path, ...] = ()
     map_path: Path | None = None
     first: int | None = None
     last: int | None = None
@@ -115,7 +118,7 @@ class TrackOptions(ObjectOptions):
     def input_files(self) -> list[Path]:
         """All files and folders that the run reads, whether they are there or not."""
         found = [self.frames, str(self.camera).partition("#")[0], *self.other_cameras]
-        found += [self.map_path, self.reference_image]
+        found += [*self.other_landmarks, self.map_path, self.reference_image]
         for part in self.objects:
             found += [part.model, part.landmarks, part.registration, *vars(part.initializer).values(), *part.inner]
             found.append(part.known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -25,9 +25,9 @@ from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.known_values import KnownValues
-from morph_dslam.tracking.multi_camera import RigCamera
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.views import registered_keyframes
 
@@ -51,6 +51,7 @@ class TrackedObject:
     points : places of it that are followed by name; None where there are none.
     known : parameters that something else measures; None where there are none.
     time_zero : time of the recording at which the model's time begins, seconds; None where it is not known.
+    other_landmarks : in what the second camera of a rig saw in the reference frame, the third, and so on.
     """
 
     name: str
@@ -66,6 +67,7 @@ class TrackedObject:
     points: NamedPoints | None = None
     known: KnownValues | None = None
     time_zero: float | None = None
+    other_landmarks: tuple[Landmarks, ...] = ()
 
     @property
     def scene(self) -> Scene | None:
@@ -77,8 +79,8 @@ class TrackedObject:
         """What finds the object in any frame; None where landmarks or a registration give it in one."""
         return None if isinstance(self.start, Registration | Landmarks) else self.start
 
-    def register(self, camera: Camera, frame: Frame, landmarks: Landmarks | None = None) -> Registration:
-        """The object in a frame, by these landmarks, or by what it starts from.
+    def register(self, cameras: Sequence[RigCamera], frame: Frame, landmarks: Landmarks | None = None) -> Registration:
+        """The object in a frame of the first camera, by these landmarks, or by what it starts from.
 
         Raises
         ------
@@ -88,12 +90,17 @@ class TrackedObject:
         start = landmarks or self.start
         if isinstance(start, Registration):
             return start
+        camera = cameras[0].camera
         if isinstance(start, Landmarks):
-            depth = frame.depth if self.options.use_depth else None
+            others = list(zip(cameras[1:], self.other_landmarks, strict=False)) if start is self.start else []
+            # Several cameras show how far away the object is.
+            depth = frame.depth if self.options.use_depth and not others else None
             at_rest = self.at_rest and start is self.start
             image = np.asarray(frame.image, dtype=np.uint8) if self.snap else None
             sigma = self.options.depth_sigma
-            return register_landmarks(self.model, camera, start, self.click_px, depth, sigma, at_rest, image=image)
+            return register_landmarks(
+                self.model, camera, start, self.click_px, depth, sigma, at_rest, image=image, others=others
+            )
         return register_by_initializer(start, self.model, camera, np.asarray(frame.image, dtype=np.uint8))
 
     def tracker_options(self, registration: Registration) -> TrackerOptions:
@@ -134,7 +141,10 @@ def load_objects(run: TrackOptions, camera: Camera) -> list[TrackedObject]:
     camera : the first one.
     """
     scene_of = cache(partial(load_scene, camera=camera))  # objects mostly share one
-    return [_load_object(str(name), part, run, scene_of) for name, part in zip(run.folders, run.objects, strict=True)]
+    first, *more = (
+        _load_object(str(name), part, run, scene_of) for name, part in zip(run.folders, run.objects, strict=True)
+    )
+    return [replace(first, other_landmarks=tuple(load_landmarks(path) for path in run.other_landmarks)), *more]
 
 
 def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Callable[[Path], Scene]) -> TrackedObject:

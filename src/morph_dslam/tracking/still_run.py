@@ -19,11 +19,12 @@ from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.known_state import LandmarkDepthTerm, LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import Box
-from morph_dslam.tracking.multi_camera import RigCamera, RigTracker
+from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import PoseFrom
 from morph_dslam.tracking.placement import PlacedObject
 from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyframes, landmark_deviation
 from morph_dslam.tracking.reregistration import Reregistration
+from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
 from morph_dslam.tracking.still_notices import still_notices
 from morph_dslam.tracking.tracker import Tracker
