@@ -229,6 +229,7 @@ def test_a_registration_in_a_map_is_refused_without_its_scene(recording, pose):
     assert tracker.track(second).tracked
 
 
+@pytest.mark.slow
 def test_the_outline_counts_where_only_keyframes_show_what_the_object_looks_like(recording):
     """They hold no grey values, so how bright the object is inside is learnt from the first frame."""
     folder, truth = recording
@@ -298,6 +299,7 @@ def test_a_free_object_starts_live_from_landmarks_in_the_first_frame(recording, 
     assert not (tmp_path / "augmented.mp4").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupt_keeps_a_live_run(recording, monkeypatch, capsys, tmp_path):
     folder, _ = recording
     show, shown = VideoSink.__call__, []

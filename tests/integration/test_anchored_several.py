@@ -97,6 +97,7 @@ def landmarks(recording, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("anchored_first", [True, False])
 def test_a_free_object_beside_an_anchored_one(recording, landmarks, tmp_path, anchored_first):
     folder, truth = recording
@@ -156,6 +157,7 @@ def with_both(folder, output, *more, first="wedge", front=None, aside=None):
     return [*arguments, "--with", str(aside or folder / "aside")]
 
 
+@pytest.mark.slow
 def test_an_anchored_object_before_two_cameras(recording, tmp_path, capsys):
     folder, truth = recording
     assert main(with_both(folder, tmp_path / "run")) == 0
@@ -172,6 +174,7 @@ def test_an_anchored_object_before_two_cameras(recording, tmp_path, capsys):
     assert (apart < 3.0 * column(tmp_path / "run", "pose_std")[:, 3:]).all()
 
 
+@pytest.mark.slow
 def test_two_objects_before_two_cameras(recording, tmp_path):
     """What the wedge occludes of the sheet, in each camera, in the reference frames and later, does not count."""
     folder, truth = recording
@@ -198,6 +201,7 @@ def covered(folder, truth, target, number, frames):
     return target
 
 
+@pytest.mark.slow
 def test_what_one_camera_does_not_see_the_other_tells_and_else_it_is_hidden(recording, tmp_path):
     folder, truth = recording
     front = covered(folder, truth, tmp_path / "front", 0, range(SCAN + 2, FRAMES))
@@ -261,6 +265,7 @@ def test_recordings_that_do_not_go_together_are_refused(recording, tmp_path, ref
     assert f"frame {SCAN - 1} is not in" in refused(*with_both(folder, tmp_path / "run", aside=beside))
 
 
+@pytest.mark.slow
 def test_another_recording_than_the_scan_begins_with_an_undeformed_frame(recording, tmp_path, refused):
     folder, truth = recording
     front, aside = (renumbered(folder / name, tmp_path / name, 100) for name in ("front", "aside"))
@@ -299,6 +304,7 @@ def live_command(folder, output, *more):
     return ["live", *map(str, [*arguments, *more])]
 
 
+@pytest.mark.slow
 def test_two_objects_are_tracked_live_in_one_map(recording, tmp_path, capsys, refused):
     folder, truth = recording
     run = tmp_path / "run"

@@ -124,6 +124,7 @@ def give_up_above(bulge: float, monkeypatch) -> None:
     monkeypatch.setattr(GrippedSheet, "solve", limited)
 
 
+@pytest.mark.slow
 def test_failed_samples_are_named_and_the_rest_is_kept(built: Path, tmp_path: Path, monkeypatch) -> None:
     """A solver that gives up above a bulge of 11 mm: the model is still built, the certificate says so."""
     give_up_above(11e-3, monkeypatch)
@@ -135,6 +136,7 @@ def test_failed_samples_are_named_and_the_rest_is_kept(built: Path, tmp_path: Pa
     assert all("beyond the limit point" in entry["reason"] for entry in failed)
 
 
+@pytest.mark.slow
 def test_hopeless_range_is_refused_and_solved_samples_stay(tmp_path: Path, monkeypatch) -> None:
     give_up_above(6.1e-3, monkeypatch)
     (tmp_path / "study.toml").write_text(STUDY.replace('"12 mm"', '"60 mm"').replace("-12 mm", "-60 mm"))

@@ -69,6 +69,7 @@ def last_load_above(study: SolidStudy) -> float:
     return float(state.mu[0])
 
 
+@pytest.mark.slow
 def test_a_strip_that_snaps_through_is_said_to_jump(tmp_path: Path, capsys) -> None:
     """It bulges up where the interval begins and down where it ends; small steps lose it there too."""
     (tmp_path / "study.toml").write_text(SNAP)
@@ -90,6 +91,7 @@ def test_a_strip_that_snaps_through_is_said_to_jump(tmp_path: Path, capsys) -> N
     assert model.certificate["warnings"][0] == printed[0].removeprefix("warning: ")
 
 
+@pytest.mark.slow
 def test_samples_that_do_not_reach_the_tolerance_are_said_to(tmp_path: Path) -> None:
     """A block of three parameters from 8 solutions: the tolerance is out of reach, and the place is in the box."""
     study = BLOCK | {

@@ -7,12 +7,14 @@ import sys
 
 import cv2
 import numpy as np
+import pytest
 
 from tests.support.real_data import ROOT
 
 EXAMPLE = ROOT / "examples" / "cantilever_pgd"
 
 
+@pytest.mark.slow
 def test_pgd_of_the_cantilever_is_as_good_as_the_best_separation():
     done = subprocess.run([sys.executable, str(EXAMPLE / "run.py")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -145,6 +145,7 @@ def test_what_a_folder_lacks_or_has_twice_is_named(project, refused):
     assert "does not say where the object is" in refused("track", project)
 
 
+@pytest.mark.slow
 def test_a_model_is_built_from_the_study_in_the_folder(project, refused):
     """A block, whose landmarks are those of something else: the model is there, and the landmarks are refused."""
     (project / "rubber.morph").unlink()

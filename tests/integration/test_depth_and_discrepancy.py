@@ -59,6 +59,7 @@ def errors(run):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_the_shape_beyond_the_model_is_found_over_the_sequence(inputs):
     _, plain = tracked(inputs, "plain", "--refine")
     folder, found = tracked(inputs, "found", "--refine", "--discrepancy")
@@ -126,6 +127,7 @@ def test_depth_puts_the_object_right_along_the_sight_line(recording, tmp_path):
     assert '"depth_used": true' in (tmp_path / "with" / "summary.json").read_text()
 
 
+@pytest.mark.slow
 def test_depth_images_in_millimetres(recording, tmp_path, refused):
     """As RealSense and Kinect cameras write them; read as 5000 values a metre they are a fifth of the distances."""
     shutil.copytree(recording, tmp_path / "mm")

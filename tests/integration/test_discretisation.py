@@ -251,6 +251,7 @@ def test_finer_elements_find_the_same_homogeneous_state() -> None:
         assert np.abs(difference).max() < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cells", "width", "divisions"), [("hex20", "20 mm", [6, 7, 1]), ("tet10", "40 mm", [4, 8, 1])]
 )

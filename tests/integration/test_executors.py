@@ -53,6 +53,7 @@ def expected(tmp_path_factory) -> bytes:
     return (folder / "block.morph").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard(expected: bytes, tmp_path: Path) -> None:
     write_study(tmp_path)
     ended = run(tmp_path, f'import morph_dslam as md\nprint("run")\n{BUILD}')
@@ -61,6 +62,7 @@ def test_a_script_needs_no_main_guard(expected: bytes, tmp_path: Path) -> None:
     assert (tmp_path / "block.morph").read_bytes() == expected
 
 
+@pytest.mark.slow
 def test_workers_know_the_laws_of_files_that_a_script_imports(tmp_path: Path) -> None:
     write_study(tmp_path, SOFTENED)
     (tmp_path / "softened.py").write_text(LAW)
@@ -74,6 +76,7 @@ def test_workers_know_the_laws_of_a_script_with_a_main_guard(tmp_path: Path) -> 
     assert ended.returncode == 0, ended.stderr
 
 
+@pytest.mark.slow
 def test_a_script_whose_own_laws_need_a_main_guard_is_told_so(tmp_path: Path) -> None:
     write_study(tmp_path, SOFTENED)
     ended = run(tmp_path, f"{LAW}\nimport morph_dslam as md\n{BUILD}")
@@ -84,6 +87,7 @@ def test_a_script_whose_own_laws_need_a_main_guard_is_told_so(tmp_path: Path) ->
     assert not (tmp_path / "block.morph").exists()
 
 
+@pytest.mark.slow
 def test_forked_workers_do_not_keep_the_folder_locked(tmp_path: Path) -> None:
     """They inherit what is open in the main process; the held-out samples are solved in a sweep of their own."""
     write_study(tmp_path, ('method = "pod"\nmax_degree = 2\n', 'method = "galerkin"\n'))

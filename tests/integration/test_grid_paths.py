@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from morph_dslam.studies import solid_sweep, sweep
 from morph_dslam.studies.executors import SerialExecutor
@@ -32,6 +33,7 @@ def straight(samples, scale, root, solved=(), failed=()):
     return [number for number in range(len(samples)) if number not in solved], [-1] * len(samples)
 
 
+@pytest.mark.slow
 def test_paths_on_a_grid_need_few_cut_steps(tmp_path: Path, monkeypatch) -> None:
     """A bar bent far; a step is cut where the prediction from its start does not lead to a solution."""
     study = make_study(BAR)

@@ -62,6 +62,7 @@ def followed(model, height, sign, **options):
     return np.array(errors), np.array(deviations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_the_edge_of_what_covers_a_sheet_is_not_taken_for_its_outline(model, sign):
     """Errors of the covered half: with the outline no larger than without it."""

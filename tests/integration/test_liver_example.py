@@ -167,6 +167,7 @@ def test_a_hidden_structure_is_followed_through_a_rendered_recording(tmp_path, e
     assert min(blue, red) - green > 40
 
 
+@pytest.mark.slow
 def test_without_the_mesh_the_example_says_what_is_missing(tmp_path):
     done = subprocess.run(
         [sys.executable, str(EXAMPLE / "run.py"), "--data", str(tmp_path)], capture_output=True, text=True

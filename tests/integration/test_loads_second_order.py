@@ -50,6 +50,7 @@ def uniform(loaded, pull, traction):
     return np.array([pull, *coefficients])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pull", [0.0, 60.0])
 def test_a_bent_beam_is_where_finite_elements_have_it(loaded, pull):
     """The second order leaves less than a third of what the first one misses: most of that is of third order."""
@@ -80,6 +81,7 @@ def test_a_bent_beam_keeps_its_length(loaded):
     assert moved[0] == pytest.approx(-0.6 * moved[2] ** 2 / LENGTH, rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_strip_that_bends_under_an_even_load_keeps_its_length():
     """A cantilever under an even load whose end moves by v is 4 v^2 / 7 L shorter along its axis."""
     study = {

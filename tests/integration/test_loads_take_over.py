@@ -63,6 +63,7 @@ def pulled():
     return model, points, pixels
 
 
+@pytest.mark.slow
 def test_the_load_of_the_study_is_found_where_unknown_loads_have_taken_over(pulled):
     """A start at another place ends with a push there, and a larger unknown pull; all is explained to a tenth pixel."""
     model, points, pixels = pulled
@@ -87,6 +88,7 @@ def test_the_load_of_the_study_is_found_where_unknown_loads_have_taken_over(pull
     assert estimation.search_other_shapes(right) is right
 
 
+@pytest.mark.slow
 def test_shapes_to_start_from_are_the_study_s_without_unknown_loads(pulled):
     model, _, _ = pulled
     shapes = np.array(shape_starts(model))

@@ -25,6 +25,7 @@ BLOCK = bent_block(["20 mm", "20 mm", "60 mm"], [2, 2, 6], 0.4, "25 deg", "5 mm"
 }
 
 
+@pytest.mark.slow
 def test_a_reduced_basis_is_sampled_one_solve_at_a_time(tmp_path) -> None:
     build(make_study(BLOCK), tmp_path / "block.morph")
     certificate = load_model(tmp_path / "block.morph").certificate
@@ -100,6 +101,7 @@ def test_a_build_reduces_in_its_own_threads_where_all_samples_are_found(tmp_path
         ngsolve.SetNumThreads(1)
 
 
+@pytest.mark.slow
 def test_reactions_of_a_model_balance_its_loads(tmp_path) -> None:
     study = tomllib.loads(STUDY) | {"reduction": {"method": "galerkin"}}
     model, area = build(make_study(study), tmp_path / "block.morph"), 0.02**2

@@ -53,6 +53,7 @@ def new_tracker(model, first, **options):
     return md.Tracker(model, CAMERA, known, md.TrackerOptions(use_outline=True, **options), reference=first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("inner", "outer"), [(90.0, 180.0), (170.0, 60.0)])
 def test_a_body_without_texture_is_followed_by_its_outline(model, inner, outer):
     rng = np.random.default_rng(0)

@@ -89,6 +89,7 @@ def test_a_clamped_strip_buckles_at_eulers_load_into_eulers_mode(positions: Modu
     np.testing.assert_allclose(height[:, 2], np.cos(np.pi * x / 0.297) ** 2, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_an_imperfect_strip_deflects_as_columns_do_and_goes_on_where_it_was(
     positions: ModuleType, tmp_path: Path
 ) -> None:
@@ -123,6 +124,7 @@ def test_an_imperfect_strip_deflects_as_columns_do_and_goes_on_where_it_was(
     assert last.fields["stress_top"][crest, 0] == pytest.approx(stress, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_sheet_that_cannot_arch_so_high_says_how_high_it_can(positions: ModuleType, tmp_path: Path) -> None:
     """The elastica of length L arches to 0.40315 L at most."""
     sheet = positions.BuckledSheet(0.297, 0.02, COLUMN, (10, 1), 3, 1e-5)

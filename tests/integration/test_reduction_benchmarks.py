@@ -26,6 +26,7 @@ def figures(name: str, *options: str) -> dict[str, float]:
     return {key: float(value) for key, value in re.findall(r"(\w+)=(\S+)", done.stdout.splitlines()[-1])}
 
 
+@pytest.mark.slow
 def test_a_coarse_boot_seal_is_as_near_with_twelve_modes_as_is_asked_of_the_fine_one(tmp_path: Path) -> None:
     found = figures(
         "reduction_boot_seal", "--divisions", "20", "1", "10", "--positions", "40", "--output", str(tmp_path)

@@ -51,6 +51,7 @@ def errors_and_deviations(film, results, truths=TRUTHS):
     return np.array(found).T
 
 
+@pytest.mark.slow
 def test_with_one_view_the_block_is_lost_on_its_far_side():
     _, results = tracked(new_views=False)
     lost = np.array([result.estimate is None for result in results])
@@ -76,6 +77,7 @@ def test_with_new_views_it_is_followed_all_around_and_the_first_view_takes_the_d
     assert results[int(np.argmax(views == 1))].warning(OtherReferenceView).number == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("truths", "kept"), [(TRUTHS, ()), (UNTWISTED, ("twist",))])
 def test_an_error_of_the_first_view_is_in_the_deviations_of_all(truths, kept):
     """The first view's state is off by one standard deviation in every unknown."""

@@ -212,6 +212,7 @@ def test_markers_of_all_sizes_are_printed_where_they_belong(kind, marker_mm):
         assert np.abs(found[0] - expected).max() < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["png", "pdf"])
 def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
     target = tmp_path / f"board.{suffix}"
@@ -277,6 +278,7 @@ def grey(scene, states):
     return np.ascontiguousarray(scene.stage.frame(states)[:, :, 0])
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_print_places_a_bent_sheet(scene):
     truth = scene.state(0.3)
     by_rectangle = print_on_sheet(scene).register(scene.model, CAMERA, grey(scene, [truth]))
@@ -288,6 +290,7 @@ def test_a_picture_of_the_print_places_a_bent_sheet(scene):
     assert not placed.ambiguous
 
 
+@pytest.mark.slow
 def test_a_second_sheet_with_the_print_is_told_and_another_print_is_refused(scene):
     truth = scene.state(0.3)
     two = grey(scene, [truth, aside(truth, [scene.beside, 0.02, 0.0])])
@@ -396,6 +399,7 @@ def test_a_run_starts_from_a_picture_and_is_registered_anew(recording, scene, tm
     assert (frames_of(summary, "reregistered"), frames_of(summary, "not_reregistered")) == ([7], [5])
 
 
+@pytest.mark.slow
 def test_a_live_run_is_registered_anew_in_the_frame_or_the_next_that_is_not_dropped(recording, scene, tmp_path):
     start = InitializerFiles(picture=recording / "picture.toml")
     summary = md.track(options(recording, tmp_path, initializer=start, reregister_at=((7, None),), live=True))

@@ -77,6 +77,7 @@ def box_with(margin, pixels):
     return (*(low - aside).tolist(), *(high + aside).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("margin", [0.0, 0.1, 0.3])
 def test_a_box_with_any_usual_margin_leaves_the_object_where_it_is(scan, scene, unhinted, margin):
     region, model = (FRAME, box_with(margin, seen(scan[1][FRAME], NODES))), bending_wedge()
@@ -93,6 +94,7 @@ def test_a_box_with_any_usual_margin_leaves_the_object_where_it_is(scan, scene, 
     assert found.pose_deviations()[0] > 0.01 * away > unhinted.pose_deviations()[0]
 
 
+@pytest.mark.slow
 def test_a_box_beside_the_object_is_named(scene):
     found = register(scene, bending_wedge(), region=(FRAME, (20.0, 220.0, 160.0, 340.0)))
     print(found.warnings, found.facts)
@@ -134,6 +136,7 @@ def clicks(view, unit=1.0, count=6):
     return Landmarks(unit * CORNERS[:count], pixels[:count], np.full(count, FRAME))
 
 
+@pytest.mark.slow
 def test_right_landmarks_lead_to_the_object(scan, scene):
     found = register(scene, bending_wedge(), landmarks=clicks(scan[1][FRAME]))
     assert not found.ambiguous
@@ -190,6 +193,7 @@ def places(scan):
     return EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False).search()
 
 
+@pytest.mark.slow
 def test_faces_of_one_grey_show_too_little_texture(scan, places, monkeypatch):
     plain = [replace(view, normalized=np.full_like(view.normalized, 128)) for view in scan[1]]
     monkeypatch.setattr(mesh, "CONFIRMED", 0.0)
@@ -220,6 +224,7 @@ def test_images_that_do_not_agree_are_named(scan, places, monkeypatch):
     assert reason(scan, monkeypatch, places) == NotRefined(Unrefined.IMAGES_DIFFER, 0.6)
 
 
+@pytest.mark.slow
 def test_images_that_move_the_object_off_its_edges_are_named(scan, places, monkeypatch):
     best = places[0].place
     beside = SimilarityTransform(best.scale, best.rotation, best.translation + 0.02 * best.scale)

@@ -172,6 +172,7 @@ def halves(folder):
     return [*map(str, [*soft, "--also", "hard", folder / "hard.morph", folder / "hard.csv"])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [["--forces"], ["--show", "stress"], []])
 @pytest.mark.usefixtures("command")
 def test_what_is_drawn_of_a_deformable_object_is_not_asked_of_a_rigid_one(folder, halves, tmp_path, option):

@@ -196,6 +196,7 @@ def run_command(arguments):
     return main([str(word) for word in arguments])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", ["plain", "refined", "registered anew"])
 def test_each_object_has_a_run_folder_and_all_that_one_object_has(model, two_sheets, tmp_path, capsys, more):
     options = {
@@ -441,6 +442,7 @@ def test_landmarks_in_both_cameras_place_the_sheet_better(model, rig_recording_o
     )
 
 
+@pytest.mark.slow
 def test_cameras_that_do_not_agree_are_named_and_one_recording_twice_is_refused(
     rig_recording_of_sheet, tmp_path, capsys, refused
 ):
@@ -508,6 +510,7 @@ def test_frames_that_one_camera_lacks_have_stand_ins(cameras, missing):
         assert both.n_missing == missing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lacking", "number", "shown"), [("aside", 2, 5), ("front", 2, 4), ("front", 4, 4)])
 def test_a_frame_missing_in_one_camera_of_a_rig_is_tracked_with_the_other(
     lacking, number, shown, model, rig_recording_of_sheet, tmp_path, capsys

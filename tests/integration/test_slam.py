@@ -197,6 +197,7 @@ def small_map(request):
     return slam, film, truth[-1], to_truth(scene.trajectory, truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shift", "turn"),
     [
@@ -219,6 +220,7 @@ def test_the_camera_is_found_from_beside_the_keyframes_and_stays_found(small_map
         assert world_from_map.apply(centre) == pytest.approx(place[:3, 3], abs=0.015)
 
 
+@pytest.mark.slow
 def test_the_camera_is_found_in_no_other_room(small_map):
     elsewhere = RoomFilm(seed=8)
     frames = follow(small_map[0], [elsewhere.frame(place) for place in hand_held(12, seed=8)], first=200)
@@ -226,6 +228,7 @@ def test_the_camera_is_found_in_no_other_room(small_map):
     assert {frame.reason for frame in frames[1:]} == {NoPose(SlamReason.NO_SIMILAR_KEYFRAME)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("term", "given"), [("focal", {"fx": 577.5, "fy": 577.5}), ("centre", {"cx": 349.5})], ids=["focal", "centre"]
 )
@@ -254,6 +257,7 @@ def test_the_camera_is_refined_and_the_map_is_of_the_refined_one(tmp_path, room_
     assert np.median(path_errors(load_scene(run / "map.h5", refined).trajectory, room_film[1])) < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off_px", "within_px"), [(1.0, 1.0), (30.0, 2.0)])
 def test_a_principal_point_is_refined_only_if_it_is_refuted(tmp_path, room_film, capsys, off_px, within_px):
     """It is stated a little beside the true one, and far from it."""
@@ -285,6 +289,7 @@ def swaying(times):
     return np.array([pose(sway[:3], sway[3:]) for sway in sways])
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_bends_neither_the_path_nor_the_points_of_a_near_object():
     bands, readout = 8, 1.0 / 30.0
     film, path = RoomFilm(seed=4, scene=near_box), swaying(np.arange(bands * 46) / (30.0 * bands))
@@ -301,6 +306,7 @@ def test_a_rolling_shutter_bends_neither_the_path_nor_the_points_of_a_near_objec
     assert np.median(front[:, 2]) == pytest.approx(1.2, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_real_rolling_shutter_is_named_and_estimated(tmp_path):
     """The truth's own readout times are about a frame interval (`rbt_scene`); its poses are good to a few mm."""
     folder = real_data("rbt_scene")
@@ -316,6 +322,7 @@ def test_a_real_rolling_shutter_is_named_and_estimated(tmp_path):
     assert after < 6.5 < before
 
 
+@pytest.mark.slow
 def test_the_usual_focal_length_of_a_real_recording_is_not_called_wrong():
     scene = map_scene(real_data("7scenes_redkitchen"), Camera(640, 480, 525.0, 525.0, 320.0, 240.0))
     wrong = [term for term, found in scene.camera_estimate().terms.items() if found.is_wrong]
@@ -346,6 +353,7 @@ def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_folder, cap
     assert later == list(range(summary["start_frame"]))
 
 
+@pytest.mark.slow
 def test_the_documented_program_hands_over_each_frame(room_folder, monkeypatch):
     monkeypatch.chdir(room_folder)
     names = {}
@@ -361,6 +369,7 @@ def test_the_documented_program_hands_over_each_frame(room_folder, monkeypatch):
     assert len(names["astray"]) == len(names["moved_to"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [3, 25])
 def test_an_interrupt_at_any_frame_keeps_what_was_mapped(tmp_path, room_folder, monkeypatch, at):
     process = Slam.process_frame
@@ -381,6 +390,7 @@ def test_an_interrupt_at_any_frame_keeps_what_was_mapped(tmp_path, room_folder, 
         assert len(load_scene(tmp_path / "run" / "map.h5", CAMERA).map.good) == summary["n_map_points"] > 80
 
 
+@pytest.mark.slow
 def test_a_young_map_that_stays_lost_is_given_up_with_its_poses(room_film):
     images, truth = room_film
     elsewhere, places = RoomFilm(seed=9), hand_held(40, seed=9)
@@ -406,6 +416,7 @@ def test_a_frozen_map_stays_and_the_camera_is_still_found(room_film):
     assert np.median(path_errors(scene.trajectory, truth[order])[-29:]) < 0.005
 
 
+@pytest.mark.slow
 def test_the_camera_is_found_in_a_saved_scene_which_may_grow(tmp_path, room_scene, room_film):
     images, truth = room_film
     room_scene.save(tmp_path / "map.h5")
@@ -429,6 +440,7 @@ def test_the_camera_is_found_in_a_saved_scene_which_may_grow(tmp_path, room_scen
     assert np.median(path_errors(grown.trajectory, truth[35:])) < 0.005
 
 
+@pytest.mark.slow
 def test_the_map_freezes_by_itself_when_a_part_of_the_scene_moves():
     film, there = RoomFilm(seed=1, scene=room_with_sheet), hand_held(80, seed=1)[:42]
     truth, images = np.array([*there, *there[:20:-1]]), []
@@ -603,6 +615,7 @@ class FilmCapture:
         pass
 
 
+@pytest.mark.slow
 def test_a_webcam_is_tracked_until_it_ends(tmp_path, room_folder, room_film, monkeypatch, capsys):
     capture, process = FilmCapture(room_film[0][:40]), Slam.process_frame
 

@@ -65,6 +65,7 @@ def followed_and_found_again(images, path):
     return np.median(path_errors(found, path)), np.linalg.norm(last - path[-10][:3, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "move"), [(10, sways), (30, creeps)])
 def test_a_sheet_that_moves_does_not_draw_the_map_along(seed, move):
     error, miss = followed_and_found_again(*sheet_film(seed, move))
@@ -72,6 +73,7 @@ def test_a_sheet_that_moves_does_not_draw_the_map_along(seed, move):
     assert miss < 0.03
 
 
+@pytest.mark.slow
 def test_a_few_wrong_points_do_not_bend_the_map_of_a_checkerboard():
     film, path = RoomFilm(seed=14, scene=checkerboard), hand_held(N_FRAMES, 14)
     error, miss = followed_and_found_again([film.frame(place) for place in path], path)
@@ -92,6 +94,7 @@ def keyframe_errors(slam, truth):
     return np.linalg.norm(fit_similarity(poses[:10], expected[:10]).apply(poses) - expected, axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threaded", [False, True])
 def test_a_round_trip_closes(monkeypatch, round_trip_film, threaded):
     images, truth = round_trip_film

@@ -107,6 +107,7 @@ def test_frames_that_have_the_numbers_of_the_maps_keyframes_are_not_taken_for_th
     assert largest_error(room, map_scene(film, rolling, known=poses, images=Film(room[1]))) < 0.005
 
 
+@pytest.mark.slow
 def test_the_camera_of_a_known_map_is_not_checked_and_one_that_is_elsewhere_is_told(room, poses):
     scene = track(room, poses)
     assert scene.camera_estimate() is None
@@ -129,6 +130,7 @@ def through_a_lens(pictures, distortion):
     return [cv2.remap(picture, x, y, cv2.INTER_LINEAR) for picture in pictures]
 
 
+@pytest.mark.slow
 def test_a_lens_that_does_not_fit_the_recording_is_named_in_a_known_map(room, colmap):
     k1, k2 = -0.25, 0.07
     pictures = through_a_lens(room[1], (k1, k2, 0.0, 0.0))
@@ -147,6 +149,7 @@ def test_a_lens_that_does_not_fit_the_recording_is_named_in_a_known_map(room, co
     assert right.summary()["flags"] == []
 
 
+@pytest.mark.slow
 def test_another_focal_length_than_the_maps_is_named(room, poses):
     """A zoom is a homography of the picture, so that the second recording needs no other renderer."""
     zoom = 1.1
@@ -268,6 +271,7 @@ def test_a_camera_is_not_placed_where_two_places_look_alike(seen_from):
     assert rightwards(found) == pytest.approx(PERIOD / 2, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_covered", "is_found"), [(12, True), (90, False)])
 def test_of_places_that_look_alike_the_one_is_taken_that_the_camera_can_have_reached(seen_from, n_covered, is_found):
     """It goes on by a quarter of a period while it is covered: the other place is three quarters away."""

@@ -44,6 +44,7 @@ def stereo():
     return recording("stereo", hand_held(36, seed=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["with_depth", "stereo"])
 def test_path_and_map_are_metric_from_the_first_frame_on(kind, request):
     film, truth = request.getfixturevalue(kind), hand_held(36, seed=1)
@@ -135,6 +136,7 @@ def metric_map(with_depth, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extend", [False, True])
 @pytest.mark.parametrize("factor", [0.2, 0.95, 1.05, 5.0])
 def test_depth_of_another_scale_than_the_known_map_is_refused(with_depth, metric_map, extend, factor):
@@ -207,6 +209,7 @@ def test_the_command_reads_recordings_with_depth_and_stereo_pairs(tmp_path, kind
     assert load_scene(tmp_path / "again" / "map.h5", load_camera(camera)).is_metric
 
 
+@pytest.mark.slow
 def test_the_unit_of_depth_images_is_given(tmp_path, with_depth, capsys, refused):
     camera = write_tum(tmp_path / "recording", with_depth.frames[:8])
     command = ["slam", tmp_path / "recording", "--camera", camera, "--no-video", "--depth-per-metre"]

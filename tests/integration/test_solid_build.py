@@ -213,6 +213,7 @@ def test_a_solid_is_filmed_and_tracked(built, tracked):
     assert figures["mean_mm"] < 0.5
 
 
+@pytest.mark.slow
 def test_unknown_loads_that_do_not_act_leave_the_result_as_it_is(built, filmed, tracked):
     """Nothing but the study's own loads acts on the block."""
     run = built / "with_loads"
@@ -238,6 +239,7 @@ def test_arrows_need_reactions(built, filmed, tmp_path, capsys):
     assert "leave out --forces" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_outline_of_a_closed_surface_counts_beside_its_texture(built, filmed):
     assert cli.main(["track", *filmed, "--outline", "--no-video", "-o", str(built / "outlined")]) == 0
     points = ["--points", str(built / "seq" / "truth.npz"), "--bind-frame", "0"]
@@ -345,6 +347,7 @@ def test_an_inverted_mesh_is_one_message(tmp_path, refused):
     assert re.search(r"morph: .*(inverted|folded|inside out)", refused("build", study, "-o", tmp_path / "x.morph"))
 
 
+@pytest.mark.slow
 def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_path, refused):
     """A long tube under inner pressure: with a thin wall p = (wall / radius) mu (1 - stretch^-4) at most."""
     text = BLOCK[: BLOCK.index("generator")] + 'generator = "tube"\ninner_radius = "19 mm"\n'
@@ -363,6 +366,7 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
     assert list((tmp_path / "x.morph.snapshots").glob("*.npz"))
 
 
+@pytest.mark.slow
 def test_python_states_the_same_study(built):
     """A dictionary in place of the file: the same solutions are found again, none is solved anew."""
     study = make_study(tomllib.loads(LOADED))

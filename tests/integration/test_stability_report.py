@@ -52,6 +52,7 @@ PART = '\n[sets.part]\nof = "x_max"\nbox = [["-1 mm", "-1 mm", "50 mm"], ["11 mm
 LOADS = {"none": "", "closed": PRESSURE.format(on=SIDES, size=100), "open": PART + PRESSURE.format(on=FACE, size=1)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", LOADS.values(), ids=LOADS)
 def test_a_bifurcation_that_was_passed_is_reported(tmp_path, capsys, load) -> None:
     (tmp_path / "study.toml").write_text(COLUMN + load)
@@ -72,6 +73,7 @@ def test_a_bifurcation_that_was_passed_is_reported(tmp_path, capsys, load) -> No
     assert f"{len(beyond)} of 15 solutions are unstable; bifurcations" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_column_with_an_imperfection_bends_out_past_its_buckling_load(tmp_path) -> None:
     """Bent inextensibly to a cosine it is shorter by (pi w / 2)^2 / length, beside what Euler's load compresses."""
     (tmp_path / "study.toml").write_text(

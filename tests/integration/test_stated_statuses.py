@@ -112,6 +112,7 @@ def test_an_absent_object_is_lost_in_every_frame_with_a_reason(name):
     assert all("agree" in line or "frames were lost" in line for line in found.said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sheet", "wedge in the hand"])
 def test_an_object_covered_for_two_seconds_is_lost_and_found_again(name):
     scene = SCENES[name](0)
@@ -129,6 +130,7 @@ def test_an_object_covered_for_two_seconds_is_lost_and_found_again(name):
     assert found.statuses[-1] == "tracked"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "seed"), [("wedge in the hand", 1), ("wedge on a table", 0)])
 def test_the_rim_of_what_covers_an_object_is_not_believed(name, seed):
     """Half covered within a frame, windows at the arm's rim agree with each other and with nothing else."""
@@ -151,6 +153,7 @@ def test_another_one_that_passes_is_not_followed(sheet, nearer):
     assert found.largest_error < 20e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1.3, 0.35])
 def test_what_looks_like_it_by_chance_on_a_cover_is_not_followed(width):
     """A print of the same kind before it: patches of it correlate with some of the object's."""
@@ -164,6 +167,7 @@ def test_what_looks_like_it_by_chance_on_a_cover_is_not_followed(width):
     assert found.back_after <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("like_it", [False, True])
 def test_one_that_is_there_instead_is_found_only_if_it_has_the_print(sheet, like_it):
     shown, free = exchanged(sheet, like_it, n_after=6)

@@ -93,6 +93,7 @@ def tracked(folder: Path, name: str, lift: float, frames: int) -> dict:
     return film_and_track(scene, folder / "bar.morph", tracker=TrackerOptions(per_sequence=("ratio",)))[0]
 
 
+@pytest.mark.slow
 def test_a_stiffness_ratio_is_estimated_over_a_sequence_with_an_interval_that_holds_it(folder):
     summary = tracked(folder, "lifted", lift=55.0, frames=24)
     assert summary["n_tracked"] == 24
@@ -103,6 +104,7 @@ def test_a_stiffness_ratio_is_estimated_over_a_sequence_with_an_interval_that_ho
     assert high - low < 0.25 * RATIO
 
 
+@pytest.mark.slow
 def test_a_stiffness_ratio_of_a_bar_that_is_not_bent_is_said_not_to_be_told(folder):
     summary = tracked(folder, "straight", lift=0.0, frames=4)
     (ratio,) = summary["one_over_the_sequence"]

@@ -117,6 +117,7 @@ def test_one_pose_from_all_frames_is_nearer_to_the_truth(recording, tmp_path):
     assert (np.abs(away(still)) < 3.5 * spread).all()
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_not_known_is_estimated(recording, tmp_path):
     save_camera(recording / "plain.yaml", replace(CAMERA, distortion=()))
     run = track(recording, tmp_path / "run", "still", "plain.yaml", refine_camera=("radial",))
@@ -252,6 +253,7 @@ def test_an_object_that_is_found_by_its_features_keeps_the_pose():
     assert found.estimate.state.parameters[0] == pytest.approx(bent.parameters[0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_live_the_pose_is_estimated_anew_from_more_frames(recording, tmp_path):
     summary = md.track(
         md.TrackOptions(

@@ -190,6 +190,7 @@ def test_the_page_shows_shape_stress_parameters_and_forces(tmp_path):
         assert page.problems == []
 
 
+@pytest.mark.slow
 def test_each_object_is_told_by_its_name(sheet, tmp_path, capsys):
     """One sheet passes another: the first has the name of its model file, the other the one that is given."""
     films = {"behind": SheetFilm(sheet, seed=1), "before": SheetFilm(sheet, seed=2)}

@@ -132,6 +132,7 @@ def test_a_repaired_surface_is_named(tmp_path):
         assert client.call("load_object", file="ball.obj", unit="mm")["notes"] == []
 
 
+@pytest.mark.slow
 def test_a_camera_file_of_another_size_is_named_before_the_start(tmp_path):
     with running_studio(tmp_path / "project") as server:
         client = Client(server)
@@ -183,6 +184,7 @@ def test_every_documented_action_is_one(server):
     assert set(re.findall(r"`(\w+)`", kinds)) == set(UPLOADS)
 
 
+@pytest.mark.slow
 def test_faces_grow_up_to_an_angle(client, folder):
     surface = client.call("load_object", file="part.inp", unit="mm")
     assert surface["extent_mm"] == pytest.approx([40, 40, 80])
@@ -347,6 +349,7 @@ def test_without_the_extra_there_is_one_message():
     )
 
 
+@pytest.mark.slow
 def test_it_ends_quietly_although_a_page_is_open(tmp_path):
     program = "import sys; from morph_dslam.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "studio", str(tmp_path / "project"), "--port", "0", "--host", "0.0.0.0"]

@@ -361,6 +361,7 @@ def test_hostile_pictures_and_cameras_are_refused(studio):
     assert client.state()["camera"] == before
 
 
+@pytest.mark.slow
 def test_a_study_cannot_name_files_outside(studio):
     client, around = studio
     before = outside(around)

@@ -93,6 +93,7 @@ def empty(tmp_path):
         yield Client(server), tmp_path / "project"
 
 
+@pytest.mark.slow
 def test_a_refused_upload_leaves_the_file_of_its_name(empty, videos):
     client, folder = empty
     pairs = "x_mm,y_mm,z_mm,u_px,v_px\n" + "1,2,3,4,5\n" * 6
@@ -118,6 +119,7 @@ def test_a_refused_upload_leaves_the_file_of_its_name(empty, videos):
     assert not [path.name for path in folder.iterdir() if path.name.startswith(".upload")]
 
 
+@pytest.mark.slow
 def test_pairs_of_another_recording_are_set_aside(tracked, videos):
     client, folder = tracked
     pairs = (folder / "landmarks.csv").read_bytes()
@@ -258,6 +260,7 @@ def test_a_run_that_fails_at_once_leaves_the_results_of_the_one_before(tracked):
     assert len((folder / "track.jsonl").read_text().splitlines()) == 6
 
 
+@pytest.mark.slow
 def test_a_run_that_is_refused_changes_nothing(tracked):
     client, folder = tracked
     (folder / "track.jsonl").write_text('{"frame": 1, "sta')  # of one that was killed
@@ -269,6 +272,7 @@ def test_a_run_that_is_refused_changes_nothing(tracked):
     assert [json.loads(line)["frame"] for line in (folder / "track.jsonl").read_text().splitlines()] == list(range(6))
 
 
+@pytest.mark.slow
 def test_a_run_is_not_shown_over_another_recording(tracked, videos):
     client, _ = tracked
     client.call("overlay", frame=3)
@@ -293,6 +297,7 @@ def test_a_run_is_not_shown_over_another_recording(tracked, videos):
     assert [row["frame"] for row in client.call("tracked_frames")["frames"]] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_replaced_while_it_is_tracked_is_not_that_of_the_run(tracked, videos):
     """Whether it was opened before or after: its first frame, or its pairs, are of the one that was there."""
     client, _ = tracked
@@ -365,6 +370,7 @@ def test_one_studio_serves_a_project(empty, refused):
     assert client.state()["folder"] == str(folder)
 
 
+@pytest.mark.slow
 def test_a_killed_studio_leaves_no_lock(tmp_path):
     program = "import sys; from morph_dslam.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "studio", str(tmp_path / "project"), "--port", "0"]

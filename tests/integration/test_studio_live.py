@@ -111,6 +111,7 @@ def test_a_phone_is_tracked_as_its_frames_are_in_python(studio, film):
     assert client.state()["recording"]["frames"] == FRAMES
 
 
+@pytest.mark.slow
 def test_what_cannot_be_tracked_is_one_message(studio, film):
     """Wrong sizes, a turned phone, no picture at all, steps in the wrong order; and the next good frame is taken."""
     server, client, folder = studio
@@ -143,6 +144,7 @@ def test_what_cannot_be_tracked_is_one_message(studio, film):
     assert "no camera sends frames" in client.refused("take_frame")
 
 
+@pytest.mark.slow
 def test_another_camera_takes_the_place_and_a_phone_comes_back(studio, film):
     """While it is tracked: the run goes on with the frames of whoever sends, numbered on."""
     server, client, folder = studio
@@ -177,6 +179,7 @@ def test_another_camera_takes_the_place_and_a_phone_comes_back(studio, film):
         assert np.linalg.norm(placed - true, axis=1).mean() < 1e-3
 
 
+@pytest.mark.slow
 def test_frames_of_an_earlier_run_stay_until_another_one_has_begun(studio, film):
     """Through a frame that is taken, and a run that fails at once; the recording is the one before meanwhile."""
     server, client, folder = studio
@@ -220,6 +223,7 @@ def test_frames_of_an_earlier_run_stay_until_another_one_has_begun(studio, film)
     assert client.state()["notes"]["run"] is None
 
 
+@pytest.mark.slow
 def test_only_who_was_let_in_may_send_or_look(studio):
     server, client, _ = studio
     own = phone_session(server, client.state()["phone"])

@@ -124,6 +124,7 @@ def test_hostile_frames_are_refused_while_nothing_tracks(studio, film, capfd):
     assert "Traceback" not in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_who_sends_as_fast_as_the_line_allows_is_read_at_a_bounded_rate(studio, film):
     """Half a second of flood; other requests are answered meanwhile, and each frame is one of those that were sent."""
     client, server, _ = studio
@@ -138,6 +139,7 @@ def test_who_sends_as_fast_as_the_line_allows_is_read_at_a_bounded_rate(studio, 
         assert time.monotonic() - begin > 0.9  # at most 60 a second, however fast the machine
 
 
+@pytest.mark.slow
 def test_hostile_frames_do_not_stop_a_run(studio, film):
     """Frames of the right size that break in the decoder come between good ones, which are found again."""
     client, server, folder = studio

@@ -316,6 +316,7 @@ def test_a_session_takes_trackers_by_name_frames_and_a_list_of_sinks(model):
             Session({"sheet": tracker}, [], sinks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("second", "message"),
     [
@@ -431,6 +432,7 @@ def test_second_identical_object_is_not_taken_for_the_first(model, film):
     assert mean_error(model, result.estimate.state, changed[1]) < 1.5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_mm", [12.0, 37.0, 70.0])
 def test_a_regular_print_is_not_found_a_period_off(model, moved_mm):
     """Dots are 35 mm apart. While it is hidden the sheet moves by about as much, or by two of that."""

@@ -323,6 +323,7 @@ def test_the_certificate_says_how_well_responses_are_known(file):
     assert [text for text in build_warnings(certificate) if "off by 30 %" in text]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("section", "count"),
     [
@@ -368,6 +369,7 @@ def test_supports_that_move_beside_loads_are_named(loaded):
     assert "up to the edge of 'edge'" in notice.text
 
 
+@pytest.mark.slow
 def test_places_that_are_held_have_no_loads():
     """A pressure there would move nothing: of unit compliance, its force would be beyond all others."""
     skin = {"skin": {"box": [["-1 mm"] * 3, ["61 mm"] * 3]}}

@@ -28,6 +28,7 @@ def test_half_of_the_measurements_predict_the_other_half():
     assert float(found[2]) <= 5.5
 
 
+@pytest.mark.slow
 def test_measurements_that_are_not_there_are_one_message(tmp_path):
     done = run_example(tmp_path / "absent")
     assert done.returncode == 2

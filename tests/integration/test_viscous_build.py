@@ -71,6 +71,7 @@ def test_a_viscous_bar_relaxes_as_its_prony_series_says(tmp_path: Path) -> None:
     assert "sensitivity" not in model.certificate
 
 
+@pytest.mark.slow
 def test_a_support_moves_with_time(tmp_path: Path) -> None:
     """Strain e = rate t, small: stress rate E (0.4 t + 0.6 tau (1 - exp(-t / tau)))."""
     model = built(tmp_path, POISSON="0.0", MOTION="0.008 mm * held / 5 s", STEP="0.1 s")
@@ -81,6 +82,7 @@ def test_a_support_moves_with_time(tmp_path: Path) -> None:
         assert found == pytest.approx(np.full(len(model.nodes), stress), rel=5e-4)
 
 
+@pytest.mark.slow
 def test_a_stroke_that_grows_and_stays_is_tracked_by_forces_over_paths(tmp_path: Path) -> None:
     """Without contraction P = E / 2 (s - 1 / s) at once; S = P / s relaxes, integrated in 8000 lines (Boltzmann)."""
     pulled = [*SIDES, {"kind": "displacement", "on": "z_max", "z": "load * ramp"}]
@@ -119,6 +121,7 @@ def test_a_stroke_that_grows_and_stays_is_tracked_by_forces_over_paths(tmp_path:
         np.testing.assert_allclose(found, wanted, atol=1.3e-2 * np.abs(force).max())
 
 
+@pytest.mark.slow
 def test_an_increment_that_is_too_long_shows_in_the_discretisation_error() -> None:
     """Creep under a stress s, small: the strain is s / E (1 + g / (1 - g) (1 - exp(-(1 - g) t / tau)))."""
     gel = {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.0}
@@ -185,6 +188,7 @@ def varied(prony: dict, poisson: float, step: str, **others: Any) -> ViscousSwee
     return sweep
 
 
+@pytest.mark.slow
 def test_each_sample_has_the_history_of_its_own_parameters() -> None:
     """Without contraction P = E / 2 (s - 1 / s) at once, and the part 1 - g (1 - exp(-t / tau)) of it is left."""
     pulled = [*SIDES, {"kind": "displacement", "on": "z_max", "z": "load"}]

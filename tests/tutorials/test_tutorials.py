@@ -45,6 +45,7 @@ def run_page(page):
     return names
 
 
+@pytest.mark.slow
 def test_own_sheet():
     names = run_page("tutorials/sheet.md")
     assert names["figures"]["mean_mm"] < 0.3
@@ -59,6 +60,7 @@ def test_own_solid_in_a_scanned_scene():
     np.testing.assert_allclose(names["pushes"], names["found"], atol=0.1e-3)  # frame by frame as by the command
 
 
+@pytest.mark.slow
 def test_own_material_and_parameters():
     names = run_page("tutorials/material.md")
     assert names["model"].certificate["displacement"]["mean_relative_to_largest"] < 0.01

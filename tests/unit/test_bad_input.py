@@ -64,6 +64,7 @@ def test_an_inner_structure_that_cannot_be_written(folder, refused, name):
     assert "cannot write the inner structure" in refused(*command, "-o", folder / name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["board", "board.jpg", "", "absent/board.png", "file/board.pdf"])
 def test_a_board_that_cannot_be_written(folder, refused, name):
     before = sorted(folder.parent.iterdir())

@@ -114,6 +114,7 @@ def test_three_landmarks_in_one_frame_place_an_object_and_give_the_unit(scan):
     assert best.place.scale == pytest.approx(WORLD.scale, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.985, 1.015])
 def test_a_metric_maps_error_of_scale_is_not_one_of_distance(scan, scale):
     points, views, world = scaled(scan, scale)
@@ -128,6 +129,7 @@ def test_a_metric_maps_error_of_scale_is_not_one_of_distance(scan, scale):
     assert np.sqrt(best.covariance[0, 0]) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.2, 1.0, 3.7])
 def test_landmarks_in_a_frame_that_is_no_keyframe_place_an_object_in_a_map_of_any_unit(scan, scale):
     """The unit says where the points, which another view sees, lie beside the frame of the landmarks."""

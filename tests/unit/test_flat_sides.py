@@ -99,6 +99,7 @@ def compressed(nodes, depth):
     return nodes * (np.array([across, across, along]) - 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [0.3e-3, 0.9e-3, 2e-3])
 def test_identification_allows_for_all_that_fits(model, depth):
     """The interval holds the truth before the plate touches, if there is one at all, and is narrow after."""

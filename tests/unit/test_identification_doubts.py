@@ -287,6 +287,7 @@ def test_states_that_are_missed_are_named_though_the_others_fit() -> None:
     assert "0.5 kg, a" not in text
 
 
+@pytest.mark.slow
 def test_states_that_hardly_move_are_not_accused() -> None:
     """Nothing but the error of measurement is in the unloaded states, of which all is missed."""
     accused = 0

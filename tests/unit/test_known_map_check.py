@@ -85,6 +85,7 @@ def test_a_zoom_is_named(zoom):
     assert float(note.split("by the recording ")[1].split()[0]) == pytest.approx(525 * zoom, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [still, breathing, growing, bending])
 def test_what_deforms_is_no_zoom(moved):
     assert [note_of(recording(CAMERA, moved, seed)) for seed in range(2)] == [None] * 2

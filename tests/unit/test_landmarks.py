@@ -255,6 +255,7 @@ def test_an_object_that_is_not_at_rest_is_named_though_its_landmarks_fit_at_rest
     assert said.free_px == pytest.approx(0.4, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["clicks", "one click", "lens"])
 def test_small_errors_of_landmarks_at_rest_do_not_accuse_it(wrong):
     """Clicks of 1 px; of 0.4 px with one that is 4 px off; of 0.4 px with a lens that is 1 px off in the corners."""

@@ -99,6 +99,7 @@ def test_a_tension_test_in_elements_and_at_a_point_agree():
         assert P[0, 0] - P[1, 1] * lam**-1.5 == pytest.approx(nominal[j], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_two_terms_of_ogden_are_found_again_from_three_kinds_of_test():
     moduli, exponents = np.array([0.4e6, 0.01e6]), np.array([1.3, -2.0])
     ranges = {"uniaxial": np.linspace(1, 4, 20), "biaxial": np.linspace(1, 3, 15), "planar": np.linspace(1, 3, 15)}
@@ -127,6 +128,7 @@ def test_a_series_is_found_from_ramps_and_relaxation():
     assert max(found.fit.errors) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["independent", "smooth"])
 def test_deviations_are_those_of_repeated_tests(kind):
     stretch = np.linspace(1.05, 2.5, 40)
@@ -313,6 +315,7 @@ def test_the_command_writes_a_section_that_a_study_reads(tmp_path, capsys):
     assert "holds a fit already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_was_not_tested_and_what_unloads_is_said(tmp_path, capsys):
     stretch = np.r_[np.linspace(1.0, 3.0, 20), np.linspace(3.0, 1.2, 15)]
     stress = ogden_nominal("uniaxial", stretch, [0.3e6, 0.001e6], [1.2, 6.0])

@@ -354,6 +354,7 @@ def test_cubes_that_share_an_edge_bound_no_volume(tmp_path):
         load_mesh(tmp_path / "cubes.obj", "mm")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "repair"),
     [
@@ -374,6 +375,7 @@ def test_flawed_surfaces_are_filled_to_the_volume_of_sound_ones_and_info_says_so
     assert f"note: the surface of sphere.obj was repaired: {repair}\n" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_info_says_how_far_a_coarse_mesh_is_from_its_surface(tmp_path, capsys):
     """A tetrahedral ball of few cells lies inside the sphere, its volume as its triangles have it."""
     points, faces = icosphere(4)
@@ -496,6 +498,7 @@ def test_a_ply_file_that_ends_in_its_header_is_refused(tmp_path):
         load_mesh(tmp_path / "cut.ply", "mm", 10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["inp", "msh", "vtk", "vtu", "ply", "obj", "stl", "binary stl", "step"])
 @pytest.mark.parametrize("name", ["cube.stl", "cube.vtk", "cube"])
 def test_a_mesh_is_read_whatever_its_name(tmp_path, kind, name):

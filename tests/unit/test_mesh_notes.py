@@ -16,6 +16,7 @@ def notes_of(path, capsys, size):
     return [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
 
 
+@pytest.mark.slow
 def test_a_round_step_solid_is_said_to_lose_volume_and_stiffness(tmp_path, capsys):
     path = tmp_path / "rod.step"
     occ.Cylinder((0, 0, 0), occ.X, r=6, h=80).WriteStep(str(path))
@@ -36,6 +37,7 @@ def test_a_round_hole_is_said_to_be_filled_in_part(tmp_path, capsys):
     assert added == pytest.approx(100.0 * (part - 1.0), rel=0.05)
 
 
+@pytest.mark.slow
 def test_flat_sides_and_small_holes_are_not_spoken_of(tmp_path, capsys):
     box = occ.Box((0, 0, 0), (40, 20, 10))
     for name, solid in (("box", box), ("drilled", box - occ.Cylinder((20, 10, 0), occ.Z, r=0.7, h=10))):

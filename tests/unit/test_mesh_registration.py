@@ -93,6 +93,7 @@ def test_images_show_the_shape_of_an_arch_and_none_of_a_plate(height):
     assert found.relief_px == pytest.approx(0.0 if height == 0.0 else 3.0, abs=1e-6 if height == 0.0 else 2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [0.0, 0.015, 0.045])
 def test_an_error_of_a_metric_maps_scale_does_not_move_the_object(off):
     world = SimilarityTransform(1.0 + off, METRIC.rotation, METRIC.translation)
@@ -166,6 +167,7 @@ def test_a_place_is_ambiguous_by_another_one_alone(score, rivals, share):
     assert found.warnings == (() if share is None else (Ambiguous(Ambiguity.SECOND_PLACE, share),))
 
 
+@pytest.mark.slow
 def test_an_absent_object_is_not_found():
     nodes, triangles, _ = wedge()
     points, views = scanned(WORLD, objects=())

@@ -84,6 +84,7 @@ def test_the_contour_of_a_sphere_is_its_tangent_cone():
         assert np.diff(angles).max() < 4 * 2.0 * np.pi / len(pixels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ground", [30.0, 90.0], ids=["as bright as the rim", "as bright as within"])
 def test_the_outline_of_a_shaded_ball_is_where_it_turns_away(ground):
     """Lit from the camera (Lambert), it is darkest at its rim, which may be as bright as the ground.

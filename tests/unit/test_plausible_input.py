@@ -175,6 +175,7 @@ def test_a_folder_and_a_point_cloud_are_no_maps_but_the_message_says_what_is(tmp
         md.load_scene(tmp_path / "elsewhere", CAMERA)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("baseline_px", "is_metric"), [(0.0, False), (60.0, True)])
 def test_a_path_without_scale_has_no_error_without_alignment_of_scale(tmp_path, capsys, baseline_px, is_metric):
     times = np.arange(20.0) / 10.0
@@ -265,6 +266,7 @@ def test_a_cell_size_that_would_take_for_ever_is_refused(tmp_path, kind, lengths
         load_mesh(path, unit, size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lengths", [(10.0, 10.0, 10.0), (40.0, 40.0, 1.0)])
 def test_the_number_of_cells_is_foreseen_within_a_factor_of_two(tmp_path, monkeypatch, lengths):
     path, size = written_block(tmp_path / "block.obj", *lengths), 1.2e-3

@@ -84,6 +84,7 @@ def spoilt(change):
     return reduce
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reduce", "message"),
     [

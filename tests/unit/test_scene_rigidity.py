@@ -89,6 +89,7 @@ def test_a_right_camera_is_not_accused_where_the_scene_moved(tmp_path, speed):
     assert list(load_scene(tmp_path / "map.h5", CAMERA).camera_notes) == summary["flags"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "stated"), [(0.0, 0.03), (0.01, np.inf)], ids=["rigid", "moves"])
 def test_deviations_of_poses_are_unknown_where_the_scene_moved(tmp_path, speed, stated):
     """Else the root of the variances' sum: 0.02, 0.02 and 0.01 map units along the axes."""

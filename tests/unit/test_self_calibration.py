@@ -70,6 +70,7 @@ def recording(true, given, seed=0, reach=0.4, n_points=150, n_frames=N_FRAMES):
     return rigid_map, given, Trajectory(times, np.array(poses), np.arange(n_frames)), seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("true", "given", "wrong"),
     [
@@ -131,6 +132,7 @@ def test_a_fisheye_has_no_tangential_terms(tmp_path):
         refine_camera(tmp_path, fisheye, ("tangential",))
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_repeated_recordings():
     errors = []
     for seed in range(12):
@@ -208,6 +210,7 @@ def test_of_a_long_recording_a_part_whose_frames_share_points_counts():
     assert estimate.camera.fx == pytest.approx(525.0, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout_s", [0.03, -0.02])
 def test_the_readout_time_of_a_rolling_shutter(readout_s):
     true = replace(CAMERA, readout_s=readout_s)

@@ -39,6 +39,7 @@ def inside_another_turn(mesh, pitch, rise):
     return depth
 
 
+@pytest.mark.slow
 def test_the_overlap_of_a_coiled_bar_is_found_node_by_node():
     mesh = block((LENGTH, THICK, THICK), (160, 4, 4), "hex8")
     pitch, rise = 0.7, 0.13

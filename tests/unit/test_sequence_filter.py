@@ -288,6 +288,7 @@ def followed(seed, views, lasting=0.8):
     return (*twist_errors(estimates, states), filtered)
 
 
+@pytest.mark.slow
 def test_deviations_are_of_the_size_of_the_errors_after_leaving_a_view_and_coming_back():
     views = [0] * 10 + [1] * 10 + [0] * 10
     found = np.array([followed(seed, views)[:2] for seed in range(30)])

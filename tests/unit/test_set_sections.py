@@ -258,6 +258,7 @@ def bellows_with(path, **section):
     return make_study(content).solid_mesh()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inlet", [False, True])
 @pytest.mark.parametrize("point", [(12, 7, 8), (47, 4, 12), (21, 7, 3.2)])
 def test_the_wall_of_a_hollow_is_all_of_its_chambers_and_no_gap_between_them(tmp_path, inlet, point):
@@ -273,6 +274,7 @@ def test_the_wall_of_a_hollow_is_all_of_its_chambers_and_no_gap_between_them(tmp
     assert not ((middles[:, 2] > 4.6) & ((middles[:, 0] - 4) % 18 > 14.1)).any(), "a wall of a gap"
 
 
+@pytest.mark.slow
 def test_hollows_that_are_none(tmp_path):
     bellows(tmp_path / "bellows.step", inlet=True)
     for point, message in (

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -63,6 +64,7 @@ def points_of(views, world, rng):
     return MapPoints(np.concatenate(positions), np.concatenate(viewpoints))
 
 
+@pytest.mark.slow
 def test_a_shaded_outline_neither_shrinks_the_object_nor_its_deviation():
     """Were the edges of the images taken for the outline, it would be 7 to 19 mm farther away: 3 to 4.3 deviations."""
     edges, surface, misses, away = MeshEdges(NODES, TRIANGLES), Surface.of_mesh(NODES, TRIANGLES), [], []

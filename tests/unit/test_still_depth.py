@@ -51,6 +51,7 @@ def still_fit(seed, in_keyframes, in_reference):
     return fit_still(StillProblem(MODEL, CAMERA, start, pixels, frames, known, (), range(len(MODEL.default))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("in_keyframes", "in_reference"), [(True, False), (False, True), (True, True)])
 def test_depth_places_the_one_pose_along_the_sight_line(in_keyframes, in_reference):
     with_depth, without = (

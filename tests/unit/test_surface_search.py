@@ -23,6 +23,7 @@ def body():
     return np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", [False, True])
 def test_the_start_nearest_to_the_truth_ends_there_and_comes_first(metric):
     nodes, triangles = body()

@@ -61,6 +61,7 @@ def bound(model, state, pixels):
     return BoundPoints.from_surface(model, surface)
 
 
+@pytest.mark.slow
 def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, estimator, pixels):
     """Points are bound in a wrong reference state, and a later frame is estimated from exact measurements."""
     true_points = bound(model, REFERENCE, pixels)

@@ -114,6 +114,7 @@ def test_a_model_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
     assert len(load_model(path).nodes) == len(model.nodes)
 
 
+@pytest.mark.slow
 def test_builds(tmp_path: Path, capsys) -> None:
     study, output = str(write_study(tmp_path)), tmp_path / "block.morph"
     with largest_file(1000):

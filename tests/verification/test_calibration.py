@@ -46,6 +46,7 @@ def exact_views(camera, poses, board=BOARD):
     ]
 
 
+@pytest.mark.slow
 def test_corners_are_where_the_board_is(pictures):
     images, poses = pictures
     for image, pose in zip(images, poses, strict=True):
@@ -78,6 +79,7 @@ def test_the_command_finds_the_camera(pictures, tmp_path, capsys):
     assert (folder / "cam_calibration.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_video_is_calibrated_from_a_selection_of_its_frames(pictures, tmp_path):
     path = tmp_path / "board.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (640, 480))
@@ -144,6 +146,7 @@ def test_views_that_fit_no_camera_are_left_out():
     assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "is_told"), [(16.0, True), (0.0, False)])
 def test_pictures_of_two_cameras_are_told(shift, is_told):
     poses, rng = board_poses(CAMERA, BOARD, 16, 40.0, seed=9), np.random.default_rng(0)
@@ -170,6 +173,7 @@ def test_face_on_views_are_refused(tmp_path, refused):
     assert not output.exists()
 
 
+@pytest.mark.slow
 def test_boards_that_are_not_found_or_too_seldom(pictures, tmp_path):
     few = write_all(tmp_path / "few", pictures[0][:3])
     with pytest.raises(CameraError, match=r"the board was found in 3 images only; 5 are needed"):
@@ -241,6 +245,7 @@ def partial_poses(camera, size, n_views, seed):
     return poses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("described", "printed"),
     [(CHARUCO, lambda board: board), (TAGS, lambda board: board), (TAGS, turned_tags)],

@@ -56,6 +56,7 @@ def moved(problem: SolidProblem, push: float, by: float = 0.0) -> State:
     return State(np.array([push]), dofs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "mesh"])
 def test_an_obstacle_behind_the_wall_has_gone_through_it(kind: str) -> None:
     """Its middle comes from 2 mm before the wall's face to 6 mm behind it; the wall stays, or gives way by as much."""
@@ -102,6 +103,7 @@ def finger(push: str) -> SolidStudy:
     return study
 
 
+@pytest.mark.slow
 def test_a_large_step_of_a_rod_bends_a_finger_as_small_ones_do() -> None:
     """At 8 mm the rod has come 7.5 mm past the finger's face; a single increment would leave the finger at rest.
 

@@ -56,6 +56,7 @@ def test_circular_arc(planar: GrippedSheet) -> None:
     assert stress["bottom"][:, 0] == pytest.approx(-stress["top"][:, 0], rel=2e-3)
 
 
+@pytest.mark.slow
 def test_both_sides_are_mirror_images(held: GrippedSheet) -> None:
     points = np.array([[-0.1, 0.05], [0.0, -0.1], [0.12, 0.1]])
     result = []
@@ -67,6 +68,7 @@ def test_both_sides_are_mirror_images(held: GrippedSheet) -> None:
     assert result[0] == pytest.approx(result[1], abs=1e-7)
 
 
+@pytest.mark.slow
 def test_sensitivities_match_differences_of_solutions(held: GrippedSheet) -> None:
     coordinates = np.array([0.02, 0.8, 0.05, 0.1])
     state = held.advance(held.first_state(0.012), coordinates)
@@ -82,6 +84,7 @@ def test_sensitivities_match_differences_of_solutions(held: GrippedSheet) -> Non
         assert motions[k] == pytest.approx((forward.motion - backward.motion) / (2.0 * step), rel=1e-3, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_unreachable_coordinates_are_named() -> None:
     material = OrthotropicSheet(YOUNG, YOUNG, 0.0, YOUNG / 2.0, THICKNESS)
     held = GrippedSheet(material, Grips(LENGTH, 0.012, 0.04, 0.0, 0.0), WIDTH, (4, 2), 2)

@@ -73,6 +73,7 @@ def test_sensitivities_match_differences() -> None:
         assert error < 1e-5 * np.abs(difference[up]).max()
 
 
+@pytest.mark.slow
 def test_post_buckled_cantilever_follows_the_elastica() -> None:
     """P / P_cr at tip offsets of the elastica whose end has turned by 20, 40, 60 and 90 degrees."""
     length, width, thickness, young = 0.1, 0.01, 1e-4, 1e9
@@ -176,6 +177,7 @@ def elastica_tip(load: float) -> tuple[float, float]:
     return 1.0 - solution.y[2, -1], solution.y[3, -1]
 
 
+@pytest.mark.slow
 def test_cantilever_follows_the_elastica() -> None:
     # EI = 100 for Sze's strip, so a force of 4 at length 10 is P L^2 / EI = 4.
     tip = cantilever_path(3, 12, np.linspace(0.1, 1.0, 10), 4.0)[-1] / 10.0

@@ -61,6 +61,7 @@ def off(found: RigidTransform, true: RigidTransform) -> tuple[float, float]:
     return float(np.linalg.norm(found.translation - true.translation)), float(turn)
 
 
+@pytest.mark.slow
 def test_the_command_writes_where_three_cameras_are(filmed, tmp_path, capsys):
     command = ["calibrate", filmed / "0", "--with", filmed / "1", "--with", filmed / "2", "--board"]
     command += [filmed / "board.toml", "-o", tmp_path / "rig.yaml"]

@@ -97,6 +97,7 @@ def test_surfaces_that_bound_no_body_are_refused(tmp_path: Path) -> None:
         load_closed_surface(tmp_path / "none.stl", "m")
 
 
+@pytest.mark.slow
 def test_meshes_whose_inside_is_not_one_are_refused() -> None:
     """A part that is turned inwards is a cavity of the body around it, and refused nowhere."""
     point, inner = np.zeros((1, 3)), BALL.copy().apply_scale(0.5)

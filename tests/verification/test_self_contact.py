@@ -73,6 +73,7 @@ def test_a_ring_that_is_flattened_until_it_touches_itself() -> None:
     np.testing.assert_allclose(half.contact_forces(state.dofs, state.mu, 2).sum(axis=1), 0.0, atol=1e-9 * abs(force))
 
 
+@pytest.mark.slow
 def test_a_bent_ring_that_touches_itself_has_the_force_of_calculix(tmp_path: Path) -> None:
     """Before its walls meet at 18 mm, soon after and far beyond, as a study; on the same mesh, with other contact."""
     save_mesh(tmp_path / "ring.inp", half_ring(), "mm")
@@ -132,6 +133,7 @@ def test_derivatives_of_two_blocks() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1], ids=["a motion", "the shape"])
 def test_derivatives_of_a_ring_that_touches_itself(number: int) -> None:
     """Of displacements and reactions, with plane and self-contact, against differences of full solutions."""

@@ -21,6 +21,7 @@ from tests.support.shells import (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", ["quad4", "tri3", "quad9", "tri6"])
 def test_cantilever_under_end_shear(cells):
     shell = solved_shell(CANTILEVER_STUDY.format(n=10, cells=cells))
@@ -78,6 +79,7 @@ def test_uniform_tension_of_distorted_cells(cells, tolerance, tmp_path):
     np.testing.assert_allclose(shell.displacement("above")[1], 0.02 * across, rtol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", ["quad9", "tri3"])
 def test_a_strip_bent_to_a_circle(cells):
     """One end is turned by 90 degrees along the circle: moment and stress of pure bending."""
@@ -363,6 +365,7 @@ def test_a_cloth_whose_ends_have_come_together_by_default_hangs_as_a_catenary(wi
     )
 
 
+@pytest.mark.slow
 def test_a_cloth_by_two_corners_that_have_come_together_by_default_is_refused_with_what_builds():
     """Its defaults are to be those of corners at rest, from where it is found."""
     text = """
@@ -387,6 +390,7 @@ def test_a_cloth_by_two_corners_that_have_come_together_by_default_is_refused_wi
     assert snapshot.outputs["force_left"][2] == pytest.approx(weight / 2.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_euler_load_of_a_clamped_strip():
     """4 pi^2 E I / L^2, reached by moving one clamped end towards the other by the strain that it means."""
     length, thickness = 0.3, 2e-3

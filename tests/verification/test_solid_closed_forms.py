@@ -124,6 +124,7 @@ def test_strain_energy_is_the_work_of_the_load() -> None:
     assert problem.strain_energy(end.dofs, end.mu) == pytest.approx(0.25 * weights @ forces, rel=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poisson", [0.45, 0.4999])
 def test_a_bar_from_a_surface_file_sags_as_a_beam(poisson: float, tmp_path: Path) -> None:
     """Under so little of its weight that it stays linear: Timoshenko's cantilever, shear factor 5/6.

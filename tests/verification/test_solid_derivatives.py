@@ -165,6 +165,7 @@ def by_contact_with_a_mesh(mu: ParameterSymbols) -> SolidProblem:
 MAKERS = [value for name, value in sorted(globals().items()) if name.startswith("by_")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__[3:])
 def test_derivatives_by_a_parameter(make: Callable[[ParameterSymbols], SolidProblem]) -> None:
     from_rest = make in (by_rotation, by_displacement, by_contact, by_contact_with_a_mesh, by_shape_in_contact)

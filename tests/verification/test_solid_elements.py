@@ -129,6 +129,7 @@ def test_cooks_membrane(cell_type: str, n: int) -> None:
     assert _tip_of_cooks_membrane(cell_type, n, small, 1.0 / 3.0) / small == pytest.approx(23.96, rel=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poisson", [0.45, 0.4999])
 def test_cooks_membrane_rises_by_a_third_of_its_end(poisson: float) -> None:
     """Of hexahedra with enhanced strains as of second-order ones, which are within 0.1 % of those on 32 x 32 cells."""

@@ -43,6 +43,7 @@ def octant(cell_type: str, divisions: tuple[int, int, int]) -> Mesh:
     return replace(mesh, node_sets=planes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cell_type", "divisions", "mixed", "tolerance"),
     [("hex27", (2, 2, 2), True, 2e-3), ("hex8", (4, 4, 4), None, 0.01)],
