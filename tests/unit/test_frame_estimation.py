@@ -38,7 +38,7 @@ def test_every_shape_is_handed_out_once_before_any_is_repeated():
     model = bent_sheet_model(22, 16)
     search, estimate = ShapeSearch(model, 3), determined(model)
     count = len(shape_starts(model))
-    given = [state.parameters for _ in range(count) for state in search.starts(estimate, anywhere=True)]
+    given = [state.parameters for _ in range(count) for state in search.spread(estimate, 3)]
     np.testing.assert_array_equal(given[0], model.default)
     assert len(np.unique(np.round(given[:count], 9), axis=0)) == len(np.unique(shape_starts(model), axis=0))
     np.testing.assert_array_equal(given[:count], given[count : 2 * count])
@@ -51,7 +51,7 @@ def test_a_mirrored_bend_is_left_by_way_of_another_start():
     truth = State(np.array([0.03, 0.2, 0.05]), POSE)
     pixels, weights = CAMERA.project(points.in_camera(truth)), np.ones(150)
     estimator = Estimator(model, CAMERA, EstimationOptions(max_iterations=10, tolerance=1e-3))
-    starts = ShapeSearch(model, 4).starts(determined(model), anywhere=True)
+    starts = ShapeSearch(model, 4).spread(determined(model), 4)
     best = estimator.estimate_from(points, pixels, weights, starts)[0]
     np.testing.assert_allclose(best.state.parameters, truth.parameters, atol=5e-3)
 
@@ -98,7 +98,7 @@ def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
     assert stuck.at_bound[0]
     assert stuck.state.parameters[0] < 1e-3
     for _ in range(3):
-        starts = search.starts(stuck, anywhere=False)
+        starts = search.off_bound(stuck)
         assert len(starts) == 2
         found = [estimator.estimate(points, pixels, weights, s, prior=known) for s in starts]
         best = min(found, key=lambda estimate: estimate.cost)
@@ -107,7 +107,7 @@ def test_an_estimate_leaves_a_bound_that_it_reached_on_the_wrong_side():
     load, side = best.state.parameters
     assert abs(load - truth.parameters[0]) < 0.01
     assert np.cos(side - truth.parameters[1]) > np.cos(0.02)
-    assert search.starts(best, anywhere=False) == []
+    assert search.off_bound(best) == []
 
 
 @pytest.mark.parametrize(

@@ -44,8 +44,9 @@ _Measured = tuple[BoundPoints, Array, Array]
 #: How far an outline that is alone is searched for, pixels: the first after a loss only. That is for an object of this
 #: extent in the image, pixels; where it is larger, so are its motion and what the model leaves, up to this factor.
 REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
-#: Share of the cost below which another shape is a better explanation and not the same one.
-CLEARLY_BETTER = 0.95
+#: Share of the cost below which another shape is a better explanation and not the same one; where the residuals are
+#: small, so that noise may prefer another shape, it is better below the second share.
+CLEARLY_BETTER, MUCH_BETTER = 0.95, 0.8
 #: Other shapes are tried on at least so many points, where there are as many, and at most twice as many.
 SCOUTED = 80
 #: Depths this many times as far as the points have the object are in another unit, or of another camera.
@@ -75,22 +76,13 @@ class ShapeSearch:
         self._model, self._shapes, self._count = model, shapes[np.concatenate([[0], order])], count
         self._next, self._random = 0, np.random.default_rng(0)
 
-    def starts(self, estimate: Estimate, anywhere: bool) -> list[State]:
-        """The next starts in the pose of an estimate.
+    def spread(self, estimate: Estimate, count: int) -> list[State]:
+        """The next shapes, so many, of those spread over the box, in the pose of an estimate."""
+        rows = (self._next + np.arange(count)) % len(self._shapes)
+        self._next = (self._next + count) % len(self._shapes)
+        return [replace(estimate.state, parameters=self._shapes[row]) for row in rows]
 
-        Parameters
-        ----------
-        estimate : starts off a bound are for
-        anywhere : whether shapes spread over the box are wanted too
-        """
-        found = self._off_bound(estimate)
-        if anywhere:
-            rows = (self._next + np.arange(self._count)) % len(self._shapes)
-            self._next = int(rows[-1] + 1)
-            found += [replace(estimate.state, parameters=self._shapes[row]) for row in rows]
-        return found
-
-    def _off_bound(self, estimate: Estimate) -> list[State]:
+    def off_bound(self, estimate: Estimate) -> list[State]:
         """Starts a little inside the box with other values of what is unobservable; none if not needed."""
         model, state = self._model, estimate.state
         d = len(model.study_parameters)
@@ -227,11 +219,17 @@ class FrameEstimation:
         estimate = attempt.estimate
         if attempt.outline_alone or not estimate.sigma_px < np.inf:
             return attempt
-        anywhere = estimate.sigma_px > self._options.search_above_px or self._loads_hide_much(attempt)
-        starts = self._search.starts(estimate, anywhere)
-        if anywhere and self._study_scout is not None:
-            return self._with_other_loads(attempt, self._by_study_alone(self._study_scout, attempt, starts))
-        return self.best_of(attempt, starts)
+        off_bound = self._search.off_bound(estimate)
+        if estimate.sigma_px > self._options.search_above_px or self._loads_hide_much(attempt):
+            starts = [*off_bound, *self._search.spread(estimate, self._options.searches)]
+            if self._study_scout is not None:
+                return self._with_other_loads(attempt, self._by_study_alone(self._study_scout, attempt, starts))
+            return self.best_of(attempt, starts)
+        attempt = self.best_of(attempt, off_bound)
+        if self._study_scout is not None:
+            return attempt
+        # A wrong shape may fit nearly as well at first, such as that of a load that has not yet made a contact.
+        return self.best_of(attempt, self._search.spread(attempt.estimate, 1), MUCH_BETTER)
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
         """Whether unknown loads take up more of the image than is left: then they may do what a parameter should."""
@@ -288,15 +286,15 @@ class FrameEstimation:
         few = (points.take(rows), pixels[rows], weights[rows] * (len(valid) / max(len(rows), 1)))
         return few, (points, pixels, weights)
 
-    def best_of(self, attempt: PoseHypothesis, starts: list[State]) -> PoseHypothesis:
-        """The attempt, or a clearly better explanation of its measurements reached from one of the starts."""
+    def best_of(self, attempt: PoseHypothesis, starts: list[State], share: float = CLEARLY_BETTER) -> PoseHypothesis:
+        """The attempt, or what explains its measurements at less than a share of its cost, from one of the starts."""
         if not starts:
             return attempt
         prior, state = attempt.prior, attempt.estimate.state
         few, every = self._few_and_all(attempt)
         best = min((self._scout.minimum(*few, start, prior=prior) for start in starts), key=lambda other: other.cost)
         for points in (few, every):
-            if self._cost(points, best.state, prior) > CLEARLY_BETTER * self._cost(points, state, prior):
+            if self._cost(points, best.state, prior) > share * self._cost(points, state, prior):
                 return attempt
         return self._trimmed(attempt.measurement, best.state, prior)
 
@@ -349,7 +347,8 @@ class FrameEstimation:
         """
         best = self._along_contour(picture, start, prior, REACHES[0] if lost else REACHES[1])
         if lost and reject(best, self._options) is not None:
-            for other in self._search.starts(best.estimate, anywhere=True):
+            others = self._search.spread(best.estimate, self._options.searches)
+            for other in [*self._search.off_bound(best.estimate), *others]:
                 moved = replace(other, camera_from_object=start.camera_from_object)
                 found = self._along_contour(picture, moved, prior, REACHES[0])
                 if found.counts[1] > best.counts[1]:

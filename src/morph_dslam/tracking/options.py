@@ -37,7 +37,7 @@ class TrackerOptions(CheckedOptions):
         standard deviations, within these limits in pixels: a model that is a pixel off must not cost it good
         points, and occluders that happen to look alike must not get in where it fits well.
     search_above_px, searches : where the residuals' spread exceeds this, so many other shapes are tried in
-        the frame as starts, in turn, lest the estimate stay in a local minimum.
+        the frame as starts, in turn, lest the estimate stay in a local minimum; one otherwise.
     least_inliers, least_share : points that must support it, as a number or a share of all, if that is fewer.
     few_sigma_px : where less than half of all points support it, their residuals must spread less than this, as they
         are or without what neighbours have in common.
