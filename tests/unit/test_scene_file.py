@@ -3,11 +3,11 @@
 import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
 from morph_dslam.errors import CameraError, ModelFileError, SceneError
+from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.render.scene_file import Surface, interpolate_key_frames, load_scene_file
 from morph_dslam.render.scene_renderer import LARGEST_PRINT, print_texture
 from morph_dslam.render.simulation import simulate
@@ -189,7 +189,7 @@ def test_folder_that_another_simulation_writes_is_left_alone(tmp_path):
     path = write_scene(tmp_path, "frames = 1\n", POSE)
     simulate(path, tmp_path / "sequence", progress=False)
     with (
-        h5py.File(tmp_path / "sequence" / "depth.h5", "a"),
+        written_hdf5(tmp_path / "sequence" / "depth.h5"),
         pytest.raises(SceneError, match=r"cannot write .*depth\.h5: is another simulation writing"),
     ):
         simulate(path, tmp_path / "sequence", progress=False)

@@ -60,24 +60,59 @@ def test_a_full_disk_ends_no_program(tmp_path: Path) -> None:
         [sys.executable, "-c", FULL], cwd=tmp_path, capture_output=True, text=True, env={"PYTHONPATH": str(PROJECT)}
     )
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout == "[Errno 27] File too large: 'large.h5'\n"
+    assert ended.stdout == "[Errno 27] File too large: 'large.h5.partial'\n"
     assert [path.name for path in tmp_path.iterdir()] == ["small.h5"]
     with h5py.File(tmp_path / "small.h5") as file:
         assert file["values"][()].tolist() == [0, 1, 2]
 
 
-def test_a_file_has_one_writer_and_takes_more(tmp_path: Path) -> None:
+def test_a_file_has_one_writer(tmp_path: Path) -> None:
     path = tmp_path / "file.h5"
     with written_hdf5(path, userblock_size=512) as file:
         file["first"] = 1.0
         with pytest.raises(BlockingIOError), written_hdf5(path):
             pass
-    with written_hdf5(path, append=True) as file:
-        file["second"] = np.arange(4)
     with h5py.File(path) as file:
-        assert (file["first"][()], file["second"][()].tolist(), file.userblock_size) == (1.0, [0, 1, 2, 3], 512)
-    with pytest.raises(FileNotFoundError), written_hdf5(tmp_path / "missing.h5", append=True):
-        pass
+        assert (file["first"][()], file.userblock_size) == (1.0, 512)
+
+
+#: Has a file open, as another program, from its first line of output to its first one of input.
+READER = """
+import sys, h5py
+with h5py.File(sys.argv[1]) as file:
+    print(file["value"][()], flush=True)
+    sys.stdin.readline()
+    print(file["value"][()])
+"""
+
+
+def test_who_reads_a_file_goes_on_with_it_while_it_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "file.h5"
+    for value in (1, 2):
+        with written_hdf5(path) as file:
+            file["value"] = value
+            if value == 2:
+                reader = subprocess.Popen(
+                    [sys.executable, "-c", READER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                )
+                assert reader.stdout is not None
+                assert reader.stdout.readline() == "1\n"
+    assert reader.communicate("\n")[0] == "1\n"
+    assert reader.returncode == 0
+    with h5py.File(path) as file:
+        assert file["value"][()] == 2
+    assert [each.name for each in tmp_path.iterdir()] == ["file.h5"]
+
+
+def test_a_file_that_fails_leaves_the_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "file.h5"
+    with written_hdf5(path) as file:
+        file["value"] = 1
+    with pytest.raises(ZeroDivisionError), written_hdf5(path) as file:
+        file["value"] = 1 / 0
+    assert [each.name for each in tmp_path.iterdir()] == ["file.h5"]
+    with h5py.File(path) as file:
+        assert file["value"][()] == 1
 
 
 def test_an_error_of_another_kind_is_not_taken_for_the_drives(tmp_path: Path) -> None:
@@ -142,21 +177,36 @@ def test_simulations(tmp_path: Path, capsys) -> None:
     assert main(["simulate", scene, "-o", str(output)]) == 0
 
 
-def tracked_run(folder: Path) -> RunFolder:
+def tracked_run(folder: Path, overwrite: bool = False) -> RunFolder:
     """A run of one frame that is not written yet."""
     results = RunResults(bent_sheet_model(22, 16), reference_frame=3)
     results.add(3, 0.0, frame_result([0.01, 0.1, 0.0], [1e-3, 0.05, 0.01], [False, False, False]))
-    return RunFolder(folder, "sheet", results, CAMERA)
+    return RunFolder(folder, "sheet", results, CAMERA, overwrite=overwrite)
 
 
 def test_runs(tmp_path: Path) -> None:
+    tracked_run(tmp_path / "before").write()  # inner loops that are compiled are kept in files too
     run = tracked_run(tmp_path / "run")
-    for size, name in ((2_000, "result.h5"), (40_000, "model.morph.partial")):
+    for size, name in ((2_000, "result.h5.partial"), (40_000, "model.morph.partial")):
         with pytest.raises(TrackingError, match=rf"cannot write .*{name}: File too large"), largest_file(size):
             run.write()
         assert not (tmp_path / "run" / name).exists()
         assert len((tmp_path / "run" / "frames.csv").read_text().splitlines()) == 2
     run.write()
+
+
+def test_a_run_is_written_whole_though_the_earlier_one_is_open(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    tracked_run(folder).write()
+    later = tracked_run(folder, overwrite=True)
+    with h5py.File(folder / "result.h5") as earlier, h5py.File(folder / "model.morph"):
+        later.results.add(4, 0.1, frame_result([0.02, 0.1, 0.0], [1e-3, 0.05, 0.01], [False, False, False]))
+        later.write()
+        assert earlier["frame"][()].tolist() == [3]
+    with h5py.File(folder / "result.h5") as file:
+        assert file["frame"][()].tolist() == [3, 4]
+    assert json.loads((folder / "summary.json").read_text())["n_frames"] == 2
+    assert not list(folder.glob("*.partial"))
 
 
 def test_frame_logs(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ text that says what the file is, and the SHA-256 of the rest.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,6 @@ from pathlib import Path
 import h5py
 
 from morph_dslam.io.hdf5_writing import written_hdf5
-from morph_dslam.io.writing import removed_on_failure
 
 #: Length of the block in bytes; HDF5 asks for a power of two from 512.
 BLOCK = 512
@@ -33,12 +31,8 @@ def _block(path: Path, title: str) -> bytes:
 @contextmanager
 def written_with_checksum(path: Path, title: str) -> Iterator[h5py.File]:
     """A new HDF5 file, which appears under its name with its checksum only when it is complete."""
-    partial = path.with_name(path.name + ".partial")
-    with written_hdf5(partial, userblock_size=BLOCK) as file:
+    with written_hdf5(path, lambda partial: write_checksum(partial, title), userblock_size=BLOCK) as file:
         yield file
-    with removed_on_failure(partial):
-        write_checksum(partial, title)
-        os.replace(partial, path)
 
 
 def write_checksum(path: Path, title: str) -> None:

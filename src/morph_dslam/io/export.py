@@ -7,10 +7,10 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import TracebackType
 from typing import Literal, get_args
 from xml.etree import ElementTree
 
-import h5py
 import meshio
 import numpy as np
 from meshio.xdmf import TimeSeriesWriter
@@ -21,6 +21,7 @@ from morph_dslam.errors import ExportError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.interrupts import WaitingInterrupts
 from morph_dslam.io.gltf import GENERATOR, Colours, write_glb
+from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.state_choice import EACH_IN_TURN, StateChoice, States, states_of_array
 from morph_dslam.io.writing import removed_on_failure
 from morph_dslam.model import ReducedModel, load_model
@@ -192,12 +193,23 @@ def write_vtu_series(folder: Path, stem: str, states: States) -> Path:
 
 
 class _SeriesWriter(TimeSeriesWriter):
-    """meshio's writer with the HDF5 file beside the XDMF file, where meshio takes the working folder."""
+    """meshio's writer with the HDF5 file beside the XDMF file, where meshio takes the working folder.
+
+    What fails leaves neither of them.
+    """
 
     def __enter__(self) -> _SeriesWriter:
-        self.h5_filename = str(self.filename.with_suffix(".h5"))
-        self.h5_file = h5py.File(self.h5_filename, "w")
+        data = self.filename.with_suffix(".h5")
+        self._written = written_hdf5(data)
+        self.h5_filename, self.h5_file = str(data), self._written.__enter__()
         return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._written.__exit__(kind, error, trace)
+        if kind is None:
+            super().__exit__()
 
 
 def write_xdmf_series(folder: Path, stem: str, states: States) -> Path:

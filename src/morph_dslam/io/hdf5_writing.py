@@ -1,11 +1,11 @@
-"""HDF5 files that are written to their end, or deleted: a full disk ends no program."""
+"""HDF5 files that appear under their names when they are complete: a full disk ends no program."""
 
 from __future__ import annotations
 
 import io
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,10 @@ if sys.platform != "win32":
     import fcntl
 
 
+#: What the name of a file ends with until it is complete.
+PARTIAL = ".partial"
+
+
 class _Drive(io.FileIO):
     """A file for the HDF5 library, which may end the program where a drive does not take what is left on closing.
 
@@ -25,8 +29,7 @@ class _Drive(io.FileIO):
 
     Parameters
     ----------
-    path : of the file.
-    append : whether to keep what it holds.
+    path : of the file, which is made anew.
 
     Attributes
     ----------
@@ -40,12 +43,11 @@ class _Drive(io.FileIO):
 
     failure: OSError | None = None
 
-    def __init__(self, path: Path, append: bool) -> None:
-        super().__init__(os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0) | (0 if append else os.O_CREAT)), "r+")
+    def __init__(self, path: Path) -> None:
+        super().__init__(os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+")
         try:
             self._lock()
-            if not append:
-                super().truncate(0)
+            super().truncate(0)
         except OSError:
             self.close()
             raise
@@ -86,24 +88,32 @@ class _Drive(io.FileIO):
 
 
 @contextmanager
-def written_hdf5(path: Path, append: bool = False, **options: Any) -> Iterator[h5py.File]:
-    """An HDF5 file to write, which is deleted if that fails.
+def written_hdf5(path: Path, complete: Callable[[Path], None] | None = None, **options: Any) -> Iterator[h5py.File]:
+    """A new HDF5 file, which takes its name, from an earlier one too, when it is complete.
+
+    Until then it stands beside, so that programs that have the earlier one open, and locked, go on with that. It is
+    deleted if it cannot be written.
 
     Parameters
     ----------
     path : of the file.
-    append : whether to keep what it holds.
+    complete : what remains to be done with the closed file, by its path, before it gets its name.
     options : for `h5py.File`.
 
     Raises
     ------
     OSError
-        Which names the file, if it cannot be written to its end.
+        Which names the file, if it cannot be written to its end; BlockingIOError if another program writes it.
     """
-    with _Drive(path, append) as drive, removed_on_failure(path):
+    partial = path.with_name(path.name + PARTIAL)
+    with _Drive(partial) as drive, removed_on_failure(partial):
         try:
-            with h5py.File(drive, "r+" if append else "w", **options) as file:
+            with h5py.File(drive, "w", **options) as file:
                 yield file
         finally:
             if drive.failure is not None:
-                raise OSError(drive.failure.errno, drive.failure.strerror, str(path)) from drive.failure
+                raise OSError(drive.failure.errno, drive.failure.strerror, str(partial)) from drive.failure
+    with removed_on_failure(partial):
+        if complete is not None:
+            complete(partial)
+        os.replace(partial, path)

@@ -185,14 +185,14 @@ def _prepare_folder(output: Path) -> None:
             pass
     except BlockingIOError as error:
         raise SceneError(
-            f"cannot write {output / 'depth.h5'}: is another simulation writing to this folder, or another "
-            "program reading the file? Name another folder, or wait for it"
+            f"cannot write {output / 'depth.h5'}: is another simulation writing to this folder? Name another folder, "
+            "or wait for it"
         ) from error
     for folder in (output / "frames", output / "depth"):
         for path in folder.iterdir():
             if re.fullmatch(r"\d{6}\.(png|jpg)", path.name):
                 path.unlink()
-    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+    for name in ("depth.h5", "rgb.txt", "depth.txt", "groundtruth.txt"):
         (output / name).unlink(missing_ok=True)
 
 

@@ -112,8 +112,7 @@ class RunFolder:
         write_csv(path / "frames.csv", run)
         save_trajectory(path / "trajectory.txt", camera_path(run))
         save_camera(path / "camera.yaml", self._camera)
-        write_hdf5(path / "result.h5", run)
-        self._centres.write(path / "result.h5")
+        write_hdf5(path / "result.h5", run, self._centres)
         save_model(path / "model.morph", run.model.without_loads)
         summary = summarise(run, notices) | facts | {"versions": _versions()}
         (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
@@ -142,8 +141,8 @@ def _versions() -> dict[str, Any]:
     }
 
 
-def write_hdf5(path: Path, run: RunResults) -> None:
-    """Write ``result.h5``."""
+def write_hdf5(path: Path, run: RunResults, centres: InnerCentres | None = None) -> None:
+    """Write ``result.h5``, with the ``centres`` of structures inside."""
     text = h5py.string_dtype()
     with written_hdf5(path) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "reference_frame": run.reference_frame})
@@ -166,6 +165,8 @@ def write_hdf5(path: Path, run: RunResults) -> None:
         file["timings_ms"] = run.timings_ms()
         file["timings_ms"].attrs["names"] = [*STAGES, "total"]
         save_discrepancies(file, [result.discrepancy for result in run.results])
+        if centres is not None:
+            centres.write(file)
 
 
 def _write_reactions(file: h5py.File, run: RunResults) -> None:
@@ -432,9 +433,8 @@ class InnerCentres:
             [lost if found is None else centre_and_std(one, found, result.discrepancy) for one in self._structures]
         )
 
-    def write(self, path: Path) -> None:
+    def write(self, file: h5py.File) -> None:
         """Add ``inner/NAME/centre`` and ``centre_std`` (f, 3), metres, NaN where lost, to ``result.h5``."""
-        with written_hdf5(path, append=True) as file:
-            for k, structure in enumerate(self._structures):
-                group = file.create_group(f"inner/{structure.name}")
-                group["centre"], group["centre_std"] = np.array([row[k] for row in self._rows]).swapaxes(0, 1)
+        for k, structure in enumerate(self._structures):
+            group = file.create_group(f"inner/{structure.name}")
+            group["centre"], group["centre_std"] = np.array([row[k] for row in self._rows]).swapaxes(0, 1)
