@@ -41,7 +41,10 @@ class Surroundings:
 
     @classmethod
     def of(cls, model: ReducedModel, points: MaterialPoints) -> Surroundings:
-        """The corners of each point's cell; of a point on a node or an edge also those of all cells about it."""
+        """The corners of each point's cell.
+
+        Of a point on a face those of the face; of one on a node or an edge those of all cells about it.
+        """
         near = _cells_about(model)
         found = [
             _grown(np.unique(corners[weights > LEAST_WEIGHT]), near, model.nodes)
