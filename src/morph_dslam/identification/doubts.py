@@ -57,7 +57,7 @@ def notices(
     ----------
     slopes : (n, f) derivatives by what was identified.
     model_rms : root mean square of the model's own errors of the predictions.
-    moduli : the common factor of all moduli that is in the predictions; None where it was not identified.
+    moduli : the common factor of all moduli by which predictions grow; None where it was not identified.
     """
     factor = size_factor(forces, predicted)
     # At an end of its range the factor has no slope.

@@ -9,8 +9,9 @@ many degrees of freedom as there are groups less unknowns, for what scatters, an
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,9 @@ from morph_dslam.identification.prior import KnownValues
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.flat_sides import LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
+
+if TYPE_CHECKING:
+    from morph_dslam.identification.given_loads import GivenLoads
 
 Array = NDArray[np.float64]
 #: Range of the common factor of all moduli, and its name among the unknowns.
@@ -115,15 +119,26 @@ class Identification:
     correlation : (k, k) of the estimates.
     misfits : of each measurement.
     groups : number of groups of values whose errors count as independent.
+    loads : of given size, beside a factor of all moduli; None where that was not identified.
     """
 
     estimates: tuple[Estimate, ...]
     correlation: Array
     misfits: tuple[Misfit, ...]
     groups: int
+    loads: GivenLoads | None = None
 
     def __getitem__(self, name: str) -> Estimate:
         return next(each for each in self.estimates if each.parameter.name == name)
+
+    def size_factor(self, forces: MeasuredForces) -> float | None:
+        """The common factor of all moduli as one of the size of forces; None where it was not identified.
+
+        It is 1 where it divides loads too: a force that balances a load is as large as that, whatever the moduli are.
+        """
+        if self.loads is None:
+            return None
+        return 1.0 if self.loads.scaled and not forces.are_shown else self[FACTOR].value
 
 
 @dataclass(frozen=True)
@@ -144,15 +159,40 @@ class _Spread:
 
 
 class _Values:
-    """Values of the unknowns, as measurements take them."""
+    """Values of the unknowns, as measurements take them.
 
-    def __init__(self, model: ReducedModel, unknowns: Sequence[Parameter], theta: Array) -> None:
-        self._model = model
+    Parameters
+    ----------
+    model : whose parameters they are.
+    unknowns : all of them, and their values ``theta`` (k,), SI.
+    scaled : names of the parameters that a factor of all moduli divides.
+
+    Attributes
+    ----------
+    beyond : values, SI, of parameters that such a division has taken out of their ranges, by name.
+    """
+
+    def __init__(
+        self, model: ReducedModel, unknowns: Sequence[Parameter], theta: Array, scaled: Collection[str] = ()
+    ) -> None:
+        self._model, self._scaled = model, scaled
         self._own = {p.name: float(value) for p, value in zip(unknowns, theta, strict=True)}
         self.factor = self._own.pop(FACTOR, 1.0)
+        self.beyond: dict[str, list[float]] = {}
 
-    def vector(self, known: Mapping[str, float]) -> Array:
-        return self._model.vector({**known, **self._own})
+    def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
+        mu = self._model.vector({**known, **self._own})
+        for k, parameter in enumerate(self._model.parameters):
+            name = parameter.name
+            if name in self._scaled and not (shown and name in known and name not in self._own):
+                mu[k] /= self.factor
+                if not parameter.in_range(mu[k]):
+                    self.beyond.setdefault(name, []).append(float(mu[k]))
+        return mu
+
+    def shown(self, names: Sequence[str]) -> Array:
+        """Those unknowns (m,) as pictures show them, in which loads are those of the model."""
+        return np.array([self._own[name] / (self.factor if name in self._scaled else 1.0) for name in names])
 
 
 def identify(
@@ -169,15 +209,15 @@ def identify(
     model : whose parameters are identified; those that are neither identified nor known keep their defaults.
     measurements : see `measurements`.
     parameters : names of those to identify.
-    moduli : whether a common factor of all moduli is identified too: it scales the forces, and changes no shape of a
-        body that is moved by its supports alone.
+    moduli : whether a common factor of all moduli is identified too: it scales the forces, and divides the parameters
+        to which loads of the study are proportional (`given_loads`).
     prior : of parameters that are known already, as from pictures; those that are not identified do not count.
 
     Raises
     ------
     IdentificationError
-        If a parameter is not the model's, nothing measured depends on one, or forces are of another size than any of
-        the model.
+        If a parameter is not the model's, nothing measured depends on one, forces are of another size than any of
+        the model, or loads act to which a factor of all moduli does no justice, or that it takes out of their ranges.
     EvaluationError
         If the force that fits best falls where the measured one grows: it is that in the opposite direction.
     """
@@ -185,15 +225,16 @@ def identify(
     prior = prior or KnownValues.none()
     if not measurements and not prior.names:
         raise IdentificationError("nothing was measured: give points or forces")
-    fit = _Fit(model, unknowns, measurements, prior)
-    found = fit.result(fit.best())
+    loads = _loads(model, measurements, parameters) if moduli else None
+    fit = _Fit(model, unknowns, measurements, prior, frozenset() if loads is None else loads.scaled)
+    found = replace(fit.result(fit.best()), loads=loads)
     for misfit in found.misfits:
         # Only now, for the sign of a force may depend on what is identified.
         if isinstance(misfit.measurement, MeasuredForces):
             misfit.measurement.compared.check_growth(misfit.predicted, misfit.measurement.values)
-            factor = found[FACTOR] if moduli else None
-            taken, at_end = (1.0, False) if factor is None else (factor.value, factor.at_bound)
-            check_size(misfit.measurement, misfit.predicted, taken, at_end)
+            taken = found.size_factor(misfit.measurement)
+            at_end = moduli and found[FACTOR].at_bound
+            check_size(misfit.measurement, misfit.predicted, 1.0 if taken is None else taken, at_end)
     return found
 
 
@@ -208,6 +249,28 @@ def _unknowns(model: ReducedModel, names: Sequence[str], moduli: bool) -> list[P
     return unknowns
 
 
+def _loads(model: ReducedModel, measurements: Sequence[Measurement], parameters: Sequence[str]) -> GivenLoads:
+    """Loads of given size beside a factor of all moduli; IdentificationError where it cannot be found with them."""
+    # Studies take long to load.
+    from morph_dslam.identification.given_loads import GivenLoads
+
+    loads = GivenLoads.of(model)
+    for measurement in measurements:
+        varied = measurement.given | set(parameters)
+        # The free zero of a load cell takes up what stays the same.
+        is_absolute = isinstance(measurement, MeasuredForces) and not measurement.free_zero
+        for load in loads.unscaled:
+            steady = load.is_steady and not load.parameters & varied
+            if is_absolute or not steady:
+                advice = "Leave the zero of the load cell free (no --no-offset), or make" if steady else "Make"
+                raise IdentificationError(
+                    f"{load.name} of the study does not grow with the moduli, and {measurement.name} depends on it: "
+                    f"one factor of all moduli cannot be found. {advice} a modulus a parameter of the study, and "
+                    "identify that (--parameter)"
+                )
+    return loads
+
+
 class _Fit:
     """One fit; ``theta`` (k,) are the unknowns over their ranges, from 0 to 1."""
 
@@ -217,8 +280,10 @@ class _Fit:
         unknowns: Sequence[Parameter],
         measurements: Sequence[Measurement],
         prior: KnownValues,
+        scaled: Collection[str] = (),
     ) -> None:
         self._model, self._unknowns, self._measurements = model, list(unknowns), list(measurements)
+        self._scaled = scaled
         names = [parameter.name for parameter in unknowns]
         self._prior = prior.of(names)
         self._is_known = np.array([names.index(name) for name in self._prior.names], dtype=np.int64)
@@ -244,9 +309,12 @@ class _Fit:
         # An interval may be wider than numbers reach.
         return np.where(self._log, np.exp(np.where(self._log, np.clip(inner, -LARGEST, LARGEST), 0.0)), inner)
 
+    def _values(self, theta: Array) -> _Values:
+        return _Values(self._model, self._unknowns, self._si(theta), self._scaled)
+
     def _predictions(self, theta: Array) -> list[tuple[Array, Array]]:
         """Of each measurement, (n,) without and with what is not known of the measurement itself."""
-        values = _Values(self._model, self._unknowns, self._si(theta))
+        values = self._values(theta)
         raw = [measurement.predict(values) for measurement in self._measurements]
         return [(own, each.adjusted(own)) for own, each in zip(raw, self._measurements, strict=True)]
 
@@ -258,7 +326,7 @@ class _Fit:
     def _residuals(self, theta: Array) -> Array:
         """What was known before comes last."""
         parts = [missed / noise for missed, noise in zip(self._missed(theta), self._noise, strict=True)]
-        away = self._si(theta)[self._is_known] - self._prior.values
+        away = self._values(theta).shown(self._prior.names) - self._prior.values
         return np.concatenate([*parts, self._whitening @ away])
 
     def best(self) -> Array:
@@ -283,6 +351,7 @@ class _Fit:
     def result(self, theta: Array) -> Identification:
         """Estimates with deviations."""
         at_bound = (theta < AT_THE_END) | (theta > 1.0 - AT_THE_END)
+        self._check_inside(theta)
         theta = np.where(at_bound, np.round(theta), theta)
         jacobian, errors = self._jacobian(theta), self._model_errors(theta)
         silent = [p.name for p, column in zip(self._unknowns, jacobian.T, strict=True) if not column.any()]
@@ -300,6 +369,20 @@ class _Fit:
         correlation = np.divide(spread.covariance, products, out=np.eye(len(std)), where=products > 0.0)
         misfits = self._misfits(theta, jacobian[:, ~at_bound], errors)
         return Identification(estimates, correlation, misfits, spread.groups)
+
+    def _check_inside(self, theta: Array) -> None:
+        """Refuse a factor of the moduli with which loads are, for the model, outside of their ranges."""
+        for measurement in self._measurements:
+            values = self._values(theta)
+            measurement.predict(values)
+            for parameter in self._model.parameters:
+                if beyond := values.beyond.get(parameter.name):
+                    ends = " to ".join(dict.fromkeys(parameter.text(end) for end in (min(beyond), max(beyond))))
+                    raise IdentificationError(
+                        f"with {FACTOR} = {values.factor:.3g} {measurement.name} is measured where the model would "
+                        f"need {parameter.name} = {ends}, outside of its range, {parameter.range_text}: build it with "
+                        "a wider one, or give what was measured at less load"
+                    )
 
     def _alike(self, theta: Array, jacobian: Array, least: float, spread: _Spread) -> Array:
         """How far (k, 2) below and above each estimate its range has values that fit nearly as well as ``least``.
@@ -369,7 +452,7 @@ class _Fit:
 
     def _model_errors(self, theta: Array) -> Array:
         """(e, n) of all measurements, in the units of their residuals; those of one unit have rows in common."""
-        values, tables = _Values(self._model, self._unknowns, self._si(theta)), self._measurements
+        values, tables = self._values(theta), self._measurements
         own = [table.model_errors(values) / noise for table, noise in zip(tables, self._noise, strict=True)]
         blocks = [np.zeros((0, sum(part.shape[1] for part in own)))]
         for unit in dict.fromkeys(table.unit for table in tables):

@@ -25,6 +25,7 @@ from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.separated import Outside
 from morph_dslam.model.stated_errors import force_error
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.units import FACTORS, smaller_units
@@ -52,8 +53,12 @@ class Unknowns(Protocol):
     factor: float
     """Common factor of all moduli."""
 
-    def vector(self, known: Mapping[str, float]) -> Array:
-        """The model's parameters (d,), SI, where those that are not identified are known."""
+    def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
+        """The model's parameters (d,), SI, where those that are not identified are known.
+
+        Loads that are ``known`` are divided by the factor of the moduli (`given_loads`), but for those that were
+        ``shown`` by pictures: with them the model, whose moduli they do not have, has the shape that was seen.
+        """
         ...
 
 
@@ -228,7 +233,7 @@ class MeasuredPoints:
         """Of nodes (r, 3), (r, 3, 3) m."""
         nodes, index = np.unique(corners, return_inverse=True)
         points = MaterialPoints(nodes[:, None], np.ones((len(nodes), 1)))
-        return self.model.restrict(points).value(mu)[index.reshape(corners.shape)]
+        return self.model.restrict(points).value(mu, "linear")[index.reshape(corners.shape)]
 
 
 def _frames(triangles: Array) -> Array:
@@ -403,6 +408,11 @@ class MeasuredForces:
     def given(self) -> frozenset[str]:
         return frozenset(self._known[0])
 
+    @property
+    def are_shown(self) -> bool:
+        """Whether pictures show the states in which they were measured."""
+        return self.curve.against == "frame"
+
     @cached_property
     def _against(self) -> Parameter | None:
         """The parameter that the curve is given by; None where it is given by frame."""
@@ -481,7 +491,14 @@ class MeasuredForces:
         return stated is not None and stated[1]
 
     def predict(self, unknowns: Unknowns) -> Array:
-        return unknowns.factor * np.array([self.compared(unknowns.vector(known)) for known in self._known])
+        return self.compared.sign * self._forces(unknowns)[:, self.compared.axis]
+
+    def _forces(self, unknowns: Unknowns) -> Array:
+        """On the support (n, 3), N."""
+        # A search by the factor may leave the range of loads, where the same state for all would end it.
+        outside: Outside = "bounded" if self.are_shown else "linear"
+        states = [unknowns.vector(known, self.are_shown) for known in self._known]
+        return unknowns.factor * np.array([self.compared.field.value(mu, outside)[0] for mu in states])
 
     def adjusted(self, predicted: Array) -> Array:
         return predicted + float(np.mean(self.values - predicted)) if self.free_zero else predicted
@@ -490,10 +507,10 @@ class MeasuredForces:
         stated = force_error(self.model, self.reaction.support)
         if stated is None:
             return np.zeros((0, len(self.values)))
-        forces = np.array([self.compared.field.value(unknowns.vector(known))[0] for known in self._known])
+        forces = self._forces(unknowns)
         # Like a factor of all forces, and of the whole force where that along an axis is a small part.
         sizes = np.linalg.norm(forces, axis=1) * np.sign(self.compared.sign * forces[:, self.compared.axis])
-        return unknowns.factor * stated[0] * sizes[None]
+        return stated[0] * sizes[None]
 
     @cached_property
     def _known(self) -> list[dict[str, float]]:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,19 +24,31 @@ from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter
 from morph_dslam.units import FACTORS
 
+if TYPE_CHECKING:
+    from morph_dslam.identification.given_loads import GivenLoads
+
 DPI = 110
 
 
 def summarise(found: Identification) -> dict[str, Any]:
     """The content of ``identification.json``, parameters in their own units, plain JSON."""
     names = [each.parameter.name for each in found.estimates]
-    moduli = found[FACTOR].value if FACTOR in names else None
     rows = [dict(zip(names, row, strict=True)) for row in found.correlation.tolist()]
     return {
         "parameters": [_figures(each) for each in found.estimates],
         "correlation": dict(zip(names, rows, strict=True)),
-        "measurements": [_misfit_figures(misfit, names, moduli) for misfit in found.misfits],
+        "measurements": [_misfit_figures(misfit, found) for misfit in found.misfits],
         "groups": found.groups,
+        **({} if found.loads is None else {"loads": _load_figures(found.loads)}),
+    }
+
+
+def _load_figures(loads: GivenLoads) -> dict[str, Any]:
+    """Those of given size, beside a factor of all moduli."""
+    return {
+        "are_known": loads.are_known,
+        "divided_by_factor": sorted(loads.scaled),
+        "not_scaled": [load.name for load in loads.unscaled],
     }
 
 
@@ -56,9 +68,9 @@ def _figures(each: Estimate) -> dict[str, Any]:
     }
 
 
-def _misfit_figures(misfit: Misfit, identified: Sequence[str], moduli: float | None) -> dict[str, Any]:
-    """Those of one measurement; ``moduli`` is the common factor of all, if one was identified."""
-    measurement = misfit.measurement
+def _misfit_figures(misfit: Misfit, found: Identification) -> dict[str, Any]:
+    """Those of one measurement."""
+    measurement, identified = misfit.measurement, [each.parameter.name for each in found.estimates]
     known, scale = {*measurement.given, *identified}, measurement.scale
     figures = {
         "name": measurement.name,
@@ -78,7 +90,7 @@ def _misfit_figures(misfit: Misfit, identified: Sequence[str], moduli: float | N
         ],
     }
     if isinstance(measurement, MeasuredForces):
-        return figures | _force_figures(misfit, measurement, identified, moduli)
+        return figures | _force_figures(misfit, measurement, identified, found.size_factor(measurement))
     if isinstance(measurement, MeasuredPoints):
         figures |= {"span_of_object": measurement.span, "states": state_figures(misfit, measurement)}
         moved = np.sqrt(3.0) * scale * root_mean_square(misfit.adjustment)
@@ -132,8 +144,25 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
             f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
             "intervals are rough"
         )
-    said += [*_model_errors(figures), *_at_default(measured, FACTOR in names)]
+    said += [*_given_loads(figures.get("loads")), *_model_errors(figures), *_at_default(measured, FACTOR in names)]
     return said + [line for each in measured for line in _measurement_lines(each)]
+
+
+def _given_loads(loads: Mapping[str, Any] | None) -> list[str]:
+    """What a common factor of all moduli supposes of loads that have no moduli."""
+    if loads is None:
+        return []
+    if not loads["are_known"]:
+        return [
+            f"note: the model does not say which loads act: {FACTOR} is right if supports alone move the object, or "
+            "all loads grow as the moduli do"
+        ]
+    if not loads["not_scaled"]:
+        return []
+    return [
+        f"note: {' and '.join(loads['not_scaled'])} of the study does not grow with the moduli: {FACTOR} is right only "
+        "where this changes the shape little; a modulus that is a parameter (--parameter) has no such limit"
+    ]
 
 
 def _parameter_lines(each: Mapping[str, Any], measurements: Sequence[Mapping[str, Any]]) -> list[str]:
