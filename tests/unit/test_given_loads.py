@@ -42,6 +42,14 @@ FORCE = '[[loads]]\nkind = "force"\non = "x_max"\nforce = ["10 N * share", "0 N"
 STROKE = '[[supports]]\nkind = "displacement"\non = "x_max"\nx = "10 mm * share"\n'
 WEIGHT = '[[loads]]\nkind = "gravity"\n'
 SPRINGS = '[[supports]]\nkind = "foundation"\non = "x_max"\nstiffness = "{}"\n'
+PATCH = """
+[[loads]]
+kind = "moving_patch"
+on = "y_max"
+force = ["1 N", "0 N", "0 N"]
+centre = ["{}", "0 mm", "0 mm"]
+width = "5 mm"
+"""
 TIME = (
     '[time]\nparameter = "time"\nstep = "1 s"\n[time.amplitudes]\nramp = { times = ["0 s", "1 s"], values = [0, 1] }\n'
 )
@@ -98,6 +106,7 @@ SCALED = {
     "springs": BODY + SPRINGS.format("1 N/m3 * share"),
     "in time": BODY + FORCE.replace("share", "share * ramp") + TIME,
     "weightless": BODY.replace("1000", "0") + FORCE + WEIGHT,
+    "a place": BODY + PATCH.format("10 mm").replace("1 N", "1 N * share"),
     "a set of that name": BODY + FORCE.replace("x_max", "share"),
 }
 
@@ -140,6 +149,11 @@ UNSCALED = {
     "a load with the stroke": (BODY + STROKE + FORCE, r"load 1 \(force\)"),
     "a load with the modulus": (BODY.replace('"1 kPa"', '"1 kPa * share"') + FORCE, r"load 1 \(force\)"),
     "springs": (BODY + STROKE + SPRINGS.format("1 N/m3"), r"support 3 \(foundation\)"),
+    "a pressure": (
+        BODY + STROKE + '[[loads]]\nkind = "pressure"\non = "y_max"\npressure = "1 kPa"\n',
+        r"load 1 \(pressure\)",
+    ),
+    "a load that is moved": (BODY + PATCH.format("10 mm * share"), r"load 1 \(moving_patch\)"),
     "a push": (BODY + '[[couplings]]\non = "x_max"\nforce = ["1 N", "0 N", "0 N"]\n', "coupling 1"),
 }
 
@@ -159,7 +173,7 @@ def test_a_free_zero_takes_up_what_is_the_same_in_all_states() -> None:
     assert "note: load 1 (gravity) of the study does not grow with the moduli" in "\n".join(
         identification_lines(summarise(found))
     )
-    for study in ("springs", "a load with the stroke", "part of a load"):
+    for study in ("springs", "a pressure", "a load that is moved", "a load with the stroke", "part of a load"):
         with pytest.raises(IdentificationError, match="one factor of all moduli cannot be found"):
             factor_of(curve_of(bar(UNSCALED[study][0]), by_stroke))
     pushed = BODY + STROKE + FORCE.replace("10 N * share", "10 N * ramp") + TIME

@@ -11,7 +11,7 @@ import json
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from morph_dslam.errors import StudyError
@@ -29,6 +29,9 @@ SECTIONS: dict[str, tuple[str, ...]] = {
 }
 NAMES = ("kind", "law", "on", "against", "kept", "file", "unit", "generator", "cells", "held")
 
+#: Kinds whose force goes with the motion of the body: that of springs, and of a pressure on a surface that changes.
+MOVING = ("foundation", "pressure")
+
 
 @dataclass(frozen=True)
 class UnscaledLoad:
@@ -38,7 +41,7 @@ class UnscaledLoad:
     ----------
     name : for people, "load 1 (gravity)".
     parameters : names of those that change it.
-    is_steady : whether it is the same in all states with the same values of these parameters.
+    is_steady : whether its force is the same in all states with the same values of these parameters.
     """
 
     name: str
@@ -134,42 +137,53 @@ def _sizes(study: Mapping[str, Any], parameters: Sequence[Parameter]) -> Iterato
         each = values if isinstance(values, list) else [values]
         return [read_affine(value, None, parameters, amplitudes) for value in each]
 
+    densities = [density for density in read([*_densities(study)]) if _acts(density)]
     for kind in ("support", "load", "coupling"):
         for number, section in enumerate(study.get(f"{kind}s") or (), start=1):
-            what = section.get("kind") or "coupling"
-            name = f"{kind} {number}" + (f" ({what})" if what != kind else "")
+            what = section.get("kind") or kind
+            where = frozenset(names) & set(_words(section, SECTIONS["loads"]))
+            load = _Load(f"{kind} {number}" + (f" ({what})" if what != kind else ""), where, what not in MOVING, names)
             if what == "gravity":
-                accelerations = read(
-                    section.get("acceleration") or list(GravityLoad.model_fields["acceleration"].default)
-                )
-                densities = read([*_densities(study)])
-                yield from (
-                    _weight(name, names, a, d) for a in accelerations for d in densities if _acts(a) and _acts(d)
-                )
-                continue
-            sizes = [size for key in SIZES if section.get(key) is not None for size in read(section[key])]
-            # The force of a spring goes with the motion.
-            yield from (_size(name, names, size, what != "foundation") for size in sizes if _acts(size))
+                along = section.get("acceleration") or list(GravityLoad.model_fields["acceleration"].default)
+                yield from (load.weight(a, d) for a in read(along) for d in densities if _acts(a))
+            else:
+                sizes = [size for key in SIZES if section.get(key) is not None for size in read(section[key])]
+                yield from (load.size(size) for size in sizes if _acts(size))
 
 
 def _acts(size: Affine) -> bool:
     return bool(size.constant or size.used)
 
 
-def _size(name: str, names: Sequence[str], size: Affine, is_steady: bool = True) -> _Size:
-    """Of one component; of a function of time alone it is not steady."""
-    factors = {names[k] for k, slope in enumerate(size.slopes) if slope}
-    factors |= {names[product.index] for product in size.products if product.index is not None}
-    alone = any(product.index is None for product in size.products)
-    used = frozenset(names[k] for k in size.used)
-    return _Size(name, used, None if size.constant or alone else frozenset(factors), is_steady)
+@dataclass(frozen=True)
+class _Load:
+    """A section of the study.
 
+    Attributes
+    ----------
+    name : for people.
+    where : names of the parameters that say where it acts.
+    is_steady : whether it keeps its force while the body moves.
+    names : of all parameters.
+    """
 
-def _weight(name: str, names: Sequence[str], acceleration: Affine, density: Affine) -> _Size:
-    """Of a product, proportional to the parameters of one factor where the other one is fixed."""
-    a, d = _size(name, names, acceleration), _size(name, names, density)
-    by = d.by if acceleration.fixed else a.by if density.fixed else None
-    return _Size(name, a.used | d.used, by, True)
+    name: str
+    where: frozenset[str]
+    is_steady: bool
+    names: Sequence[str]
+
+    def size(self, size: Affine) -> _Size:
+        """Of one component; a function of time alone is proportional to no parameter."""
+        indices = {k for k, slope in enumerate(size.slopes) if slope} | {product.index for product in size.products}
+        by = frozenset(self.names[k] for k in indices if k is not None)
+        used = self.where | {self.names[k] for k in size.used}
+        return _Size(self.name, used, None if size.constant or None in indices else by, self.is_steady)
+
+    def weight(self, acceleration: Affine, density: Affine) -> _Size:
+        """Of a product, proportional to the parameters of one factor where the other one is fixed."""
+        a, d = self.size(acceleration), self.size(density)
+        by = d.by if acceleration.fixed else a.by if density.fixed else None
+        return replace(a, used=a.used | d.used, by=by)
 
 
 def _densities(content: Any) -> Iterator[Any]:
