@@ -16,7 +16,7 @@ from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import DepthNotUsed, KnownRefuted, RejectionReason
+from morph_dslam.tracking.outcomes import BlurredByMotion, DepthNotUsed, KnownRefuted, RejectionReason
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.tracker import Tracker
@@ -92,6 +92,29 @@ def test_what_moves_farther_than_it_is_followed_is_found_whole_and_not_said_to_b
         assert (result.status, result.warnings) == ("tracked", ())
         assert result.n_inliers > 0.9 * result.n_points
         assert mean_error(model, result.estimate.state, truth) < 0.1e-3
+
+
+def test_a_frame_that_motion_blurs_is_named_and_its_deviations_hold_the_error(model, film):
+    """Two frames in which the sheet goes on by about ten pixels, three quarters of them while the shutter is open."""
+    times = np.concatenate([np.linspace(0.0, 0.05, 6), [0.12, 0.19], np.linspace(0.191, 0.21, 5)])
+    blurred, tracker = {6, 7}, start(model, film)
+    for number, time in enumerate(times[1:], start=1):
+        exposure = 0.75 * 0.07 * np.linspace(-0.5, 0.5, 15) if number in blurred else np.zeros(1)
+        frame = np.mean([film.frame(sheet_state(time + part), noise=0.0) for part in exposure], axis=0)
+        result = tracker.track((frame + film.rng.normal(0.0, 2.0, frame.shape)).clip(0, 255).astype(np.uint8))
+        assert result.status == "tracked", result.reason
+        warning, truth, found = result.warning(BlurredByMotion), sheet_state(time), result.estimate
+        assert (warning is not None) == (number in blurred)
+        if warning is not None:
+            points = [
+                CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))
+                for state in (sheet_state(time + exposure[0]), sheet_state(time + exposure[-1]))
+            ]
+            path = np.sqrt(np.mean(np.sum((points[1] - points[0]) ** 2, axis=1)))
+            assert 0.5 * path < warning.path_px < 2.0 * path
+            assert (np.abs(found.state.parameters - truth.parameters) < 3.0 * found.parameter_std).all()
+            apart = found.state.camera_from_object.translation - truth.camera_from_object.translation
+            assert (np.abs(apart) < 3.0 * np.sqrt(np.diag(found.covariance)[-3:])).all()
 
 
 def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):

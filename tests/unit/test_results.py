@@ -16,6 +16,7 @@ from morph_dslam.tracking.drawing import AugmentedView
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, State
 from morph_dslam.tracking.measurement import ReferenceAppearance, visible_surface
 from morph_dslam.tracking.outcomes import (
+    BlurredByMotion,
     CameraIgnored,
     CameraLost,
     CamerasDisagree,
@@ -148,6 +149,7 @@ def test_summary_counts_and_flags():
 PER_FRAME = [
     (ObjectMoved(), RunWarning.MOVED),
     (FewPointsAgree(0.5), RunWarning.FEW_AGREE),
+    (BlurredByMotion(9.0), RunWarning.BLURRED_BY_MOTION),
     (SamePlace("twin"), RunWarning.SAME_PLACE),
     (TimeOutside("hold", "21 s", "0 to 20 s"), RunWarning.TIME_OUTSIDE),
     (KnownRefuted("arch", "3 mm", "5 mm", 7.0), RunWarning.KNOWN_REFUTED),

@@ -20,6 +20,7 @@ from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.known_values import LEAST_SIGMA_PX, KnownParameters
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
+from morph_dslam.tracking.motion_blur import blurred_paths
 from morph_dslam.tracking.noise import (
     Correlation,
     Observations,
@@ -417,6 +418,20 @@ class FrameEstimation:
             seen.points, seen.pixels, seen.weights, attempt.estimate.state, seen.normals, attempt.prior, attempt.depths
         )
         return replace(attempt, estimate=estimate)
+
+    def with_blur(self, picture: Image, attempt: PoseHypothesis, last: State) -> PoseHypothesis:
+        """The attempt with the paths over which motion since the ``last`` state blurs the picture."""
+        seen, rows = attempt.measurement, attempt.inliers
+        if seen.rendered is None or seen.drawing is None:
+            return attempt
+        places, before = self._reference.projected(seen.drawing.state), self._reference.projected(last)
+        rows = rows & np.isfinite(before).all(axis=1)
+        asked = seen.rendered, picture.normalized, places[rows], seen.recorded[rows], (places - before)[rows]
+        if (paths := blurred_paths(*asked)) is None:
+            return attempt
+        blurred = np.zeros_like(places)
+        blurred[rows] = paths
+        return replace(attempt, blurred=blurred)
 
     def measured(self, attempt: PoseHypothesis, correlated: bool = True) -> Observations:
         """All that an attempt was made from, the outline's points after the others.

@@ -17,6 +17,7 @@ from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.known_check import refuted_values
 from morph_dslam.tracking.outcomes import (
+    BlurredByMotion,
     CameraLost,
     FewPointsAgree,
     ModelDoesNotExplain,
@@ -136,12 +137,19 @@ def _with_systematic_errors(
         return hypothesis.estimate, left.px, [ModelDoesNotExplain(left.px)] if left.is_failure else []
     left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
     doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
-    common_px, known = max(left.px, doubt_px), (past.past_information, past.keeps)
+    blurred = hypothesis.blurred
+    # What is found on a blurred path errs with the texture: all that is left may be alike for neighbours.
+    common_px = max(left.px, doubt_px if blurred is None else left.total_px)
+    known = (past.past_information, past.keeps)
     refuted = refuted_values(hypothesis, view.estimation, systematic, errors, doubt_px, whole)
-    whole = whole and not len(view.estimation.known.indices)  # learned from the images alone then
-    estimate = systematic.added(hypothesis.estimate, hypothesis.weights, common_px, hypothesis.prior, whole, *known)
+    # Learned from the images alone, and from residuals that are the object's.
+    learns = whole and blurred is None and not len(view.estimation.known.indices)
+    found, prior = hypothesis.estimate, hypothesis.prior
+    estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
-    if doubt_px:
+    if blurred is not None:
+        warnings.append(BlurredByMotion.of(blurred[hypothesis.inliers]))
+    elif doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
     beyond = systematic.beyond_reference
     if left.is_failure or (beyond is not None and beyond.is_failure):

@@ -80,6 +80,8 @@ class PoseHypothesis:
     discrepancy : what the shape has beyond the model's, once it was estimated.
     n_absent : points of an outline that is alone where what is beside the object is seen in its place (`n_absent`);
         asked after a loss only.
+    blurred : (p, 2), the paths over which motion smears the points that support it, pixels, see `blurred_paths`; None
+        where it does no harm, or is not known.
     """
 
     estimate: Estimate
@@ -92,6 +94,7 @@ class PoseHypothesis:
     depth_unused: DepthNotUsed | None = None
     discrepancy: Discrepancy | None = None
     n_absent: int = 0
+    blurred: Array | None = None
 
     @property
     def point_depths(self) -> PointDepths | None:

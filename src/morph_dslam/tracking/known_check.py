@@ -46,7 +46,9 @@ def refuted_values(
         alone = estimation.fitted(hypothesis)
         common_px = max(systematic.unexplained(alone, hypothesis.inliers).px, doubt_px)
         weights, prior = hypothesis.weights, hypothesis.prior
-        alone = systematic.added(alone, weights, common_px, prior, learns, keeps=False)
+        blurred = hypothesis.blurred
+        learns = learns and blurred is None
+        alone = systematic.added(alone, weights, common_px, prior, learns, keeps=False, blurred=blurred)
     found, variances = alone.state.parameters[rows], deviations**2 + np.diag(alone.covariance)[rows]
     if errors is not None:
         variances = variances + np.diag(errors.at(alone.state.parameters).parameters)[rows]

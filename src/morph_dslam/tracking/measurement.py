@@ -185,6 +185,7 @@ class Measurement:
     visible : (p,) which no other part of the object hides.
     spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
     drawing : of the object, made for the comparison; None where there was none.
+    rendered : (h, w), the reference view in the drawing's state, contrast-normalized; None where there was none.
     """
 
     pixels: Array
@@ -193,6 +194,7 @@ class Measurement:
     visible: NDArray[np.bool_]
     spread: Array
     drawing: Drawing | None = None
+    rendered: NDArray[np.uint8] | None = None
 
 
 @njit(cache=True, nogil=True)

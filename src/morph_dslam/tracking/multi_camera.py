@@ -26,6 +26,7 @@ from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions
 from morph_dslam.tracking.outcomes import (
+    BlurredByMotion,
     CameraIgnored,
     CameraLost,
     CamerasDisagree,
@@ -111,9 +112,14 @@ class RigErrors:
         return [view.unexplained for view in self._views(estimate, measured)]
 
     def added(
-        self, estimate: Estimate, measured: RigObservations, prior: Prior | None, common_px: Sequence[float]
+        self,
+        estimate: Estimate,
+        measured: RigObservations,
+        prior: Prior | None,
+        common_px: Sequence[float],
+        blurred: Sequence[Array | None] | None = None,
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors.
+        """The estimate with a covariance that holds both errors, and that of motion blur.
 
         Parameters
         ----------
@@ -121,6 +127,8 @@ class RigErrors:
         measured : what it was made from.
         prior : what was known of the frame's pose.
         common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
+        blurred : by camera (p, 2), the paths over which motion smears the points, pixels; None where it does no harm,
+            or for all.
         """
         views = self._views(estimate, measured)
         frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
@@ -130,9 +138,12 @@ class RigErrors:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
         stated = covariance
-        for (view, frame), px in zip(both, common_px, strict=True):
+        for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
             moved = view.systematic.pushed_by_model(frame, view.chain, gain, px)
             covariance = covariance + moved @ moved.T
+            if paths is not None:
+                moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
+                covariance = covariance + moved @ moved.T
         if self._is_known:
             pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
             transfer = gain @ np.sum(pushes, axis=0)
@@ -291,7 +302,9 @@ class RigTracker:
             left: list[Unexplained] = []
             if estimate is not None:
                 left = self._errors.unexplained(estimate, measured)
-                estimate = self._errors.added(estimate, measured, prior, [rest.px for rest in left])
+                blurred = [tracker.last_blurred for tracker in self.trackers]
+                common = [rest.px if p is None else rest.total_px for rest, p in zip(left, blurred, strict=True)]
+                estimate = self._errors.added(estimate, measured, prior, common, blurred)
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
@@ -319,7 +332,12 @@ class RigTracker:
         recovered = all(result.recovered or result.estimate is None for result in results)
         found = replace(
             result,
-            warnings=(*warnings, *([PastForgotten()] if self._filter.forgot else []), *_not_explained(results, left)),
+            warnings=(
+                *warnings,
+                *([PastForgotten()] if self._filter.forgot else []),
+                *_blurred(results),
+                *_not_explained(results, left),
+            ),
             unexplained_px=max(rest.px for rest in left),
             status=Status.TRACKED,
             estimate=estimate,
@@ -386,6 +404,12 @@ def _ignored(results: list[FrameResult], measured: RigObservations) -> list[Came
         elif not view.weights.any():
             found.append(CameraIgnored(number, result.status))
     return found
+
+
+def _blurred(results: list[FrameResult]) -> list[BlurredByMotion]:
+    """The warning of motion blur of the camera that sees most of it, if one does."""
+    found = [warning for result in results if (warning := result.warning(BlurredByMotion)) is not None]
+    return sorted(found, key=lambda warning: -warning.path_px)[:1]
 
 
 def _not_explained(results: list[FrameResult], left: list[Unexplained]) -> list[TrackingWarning]:

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from morph_dslam.notices import Notice
 
 
@@ -122,6 +125,24 @@ class FewPointsAgree(TrackingWarning):
 
     template: ClassVar[str] = "few points agree, and less closely than usual: by {spread_px:.2g} px"
     spread_px: float
+
+
+@dataclass(frozen=True)
+class BlurredByMotion(TrackingWarning):
+    """Motion blurs the picture: points are measured somewhere on their paths during the exposure, at no one instant.
+
+    Attributes
+    ----------
+    path_px : root mean square length of these paths, pixels.
+    """
+
+    template: ClassVar[str] = "motion blurs the picture, over paths of about {path_px:.0f} px"
+    path_px: float
+
+    @classmethod
+    def of(cls, paths: NDArray[np.float64]) -> BlurredByMotion:
+        """The warning of these paths (p, 2), pixels."""
+        return cls(float(np.sqrt(np.mean(np.sum(paths**2, axis=1)))))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ _F32 = np.float32
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _patch(image, x, y, patch):
+def fill_patch(image, x, y, patch):
     """Fill a patch (n, n) with the image about it less `NEUTRAL`, its first pixel at (x, y), bilinearly."""
     size, x0, y0 = len(patch), int(x), int(y)
     right, down = _F32(x - x0), _F32(y - y0)
@@ -52,8 +52,8 @@ def _both_patches(first, second, first_point, second_point, half, a, b):
     inside = min(x, y, u, v) >= 0.0
     inside &= max(x, u) + 2 * half < width - 1 and max(y, v) + 2 * half < height - 1
     if inside:
-        _patch(first, x, y, a)
-        _patch(second, u, v, b)
+        fill_patch(first, x, y, a)
+        fill_patch(second, u, v, b)
     return inside
 
 

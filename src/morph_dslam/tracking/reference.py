@@ -353,7 +353,8 @@ class ReferenceView:
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
             drift = None if picture.motion is None else picture.motion.drift(self.projected, state)
             found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets, drift)
-        return replace(found, drawing=Drawing(state, view, rendering.triangle_ids, rendering.depth))
+        drawing = Drawing(state, view, rendering.triangle_ids, rendering.depth)
+        return replace(found, drawing=drawing, rendered=rendering.image)
 
     def _draw(self, meshes: Sequence[View]) -> tuple[list[NDArray[np.uint8]], float]:
         """Make the texture.

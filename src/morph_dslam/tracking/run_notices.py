@@ -17,6 +17,7 @@ from morph_dslam.tracking.contradictions import contradictions
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run, with_deviation
 from morph_dslam.tracking.outcomes import (
+    BlurredByMotion,
     CameraIgnored,
     CameraLost,
     CamerasDisagree,
@@ -57,6 +58,11 @@ class RunWarning(StrEnum):
         "few points agree, and less closely than usual, in {count} of {n_frames} frames, first in frame {first}: "
         "something is before the object, it deforms otherwise than the model, or it was taken for what looks like it; "
         "do not rely on these frames"
+    )
+    BLURRED_BY_MOTION = (
+        "motion blurs the pictures in {count} of {n_frames} frames, first in frame {first}, over paths of up to "
+        "{largest_px:.0f} px: deviations there hold that points are measured anywhere on these; for exact ones film "
+        "with more light and a shorter exposure, or a slower motion"
     )
     SAME_PLACE = (
         "it stands where '{other}' stands in {count} of {n_frames} frames, first in frame {first}: one of both was "
@@ -242,6 +248,9 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     if 2 * len(without_rows) > len(run):
         tell(without_rows, kind.READOUT_NOT_USED)
     tell(_warned(run, FewPointsAgree), kind.FEW_AGREE)
+    blurred = _warned(run, BlurredByMotion)
+    longest = max((warning.path_px for _, warning in blurred), default=0.0)
+    tell(blurred, kind.BLURRED_BY_MOTION, largest_px=longest)
     same = _warned(run, SamePlace)
     for other in sorted({warning.other for _, warning in same}):
         tell([(frame, w) for frame, w in same if w.other == other], kind.SAME_PLACE, other=other)

@@ -274,8 +274,9 @@ class SystematicErrors:
         learns: bool = True,
         past_information: Array | None = None,
         keeps: bool = True,
+        blurred: Array | None = None,
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors.
+        """The estimate with a covariance that holds both errors, and that of motion blur.
 
         Parameters
         ----------
@@ -287,6 +288,7 @@ class SystematicErrors:
         learns : whether the residuals are the object's, so that they show how well the reference is known
         past_information : (d + 6, d + 6) with which earlier frames count in it; None where they do not
         keeps : whether later frames rest on it
+        blurred : (p, 2) pixels, the paths over which motion smears the points; None where it does no harm.
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
@@ -317,6 +319,9 @@ class SystematicErrors:
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
         by_model = gain @ (common_px / np.sqrt(share) * gradients.T + past @ self._by_model)
         covariance += by_model @ by_model.T
+        if blurred is not None:
+            by_blur = self.pushed_by_blur(frame, np.eye(len(gain)), gain, blurred)
+            covariance += by_blur @ by_blur.T
         if keeps:
             self._by_reference, self._by_model, self._by_known = by_reference, by_model, gain @ known
         return replace(estimate, covariance=covariance, stated_covariance=stated)
@@ -370,6 +375,19 @@ class SystematicErrors:
         gradients = self._common.gradients(frame.weighted_jacobian @ chain)
         share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain)
         return np.asarray(gain @ (common_px / np.sqrt(share) * gradients.T), dtype=np.float64)
+
+    def pushed_by_blur(self, frame: Linearization, chain: Array, gain: Array, blurred: Array) -> Array:
+        """How an estimate moves (n, r) by where on their paths the points were found in a picture that motion blurs.
+
+        Any place on its path is as likely for a point as any other, and alike for neighbours.
+
+        Parameters
+        ----------
+        frame, chain, gain : as in `pushed_by_model`.
+        blurred : (p, 2) pixels, the paths.
+        """
+        along = np.einsum("pkn,pk->pn", frame.weighted_jacobian, blurred / np.sqrt(12.0)) @ chain
+        return np.asarray(gain @ (self._common.factor.T @ along).T, dtype=np.float64)
 
     def held(self, measured: NDArray[np.int64]) -> Array:
         """What sensors keep from the last frame's estimate (d + 6, d), for each change of the parameters.

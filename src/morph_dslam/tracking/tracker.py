@@ -121,6 +121,7 @@ class Tracker:
     state : last known of the object.
     last_seen : where the first view's points were in the last frame that was compared with it.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
+    last_blurred : (p, 2), the paths over which motion smeared the points in it; None where it did no harm.
     is_taken : whether another object stands where this one would stand in a state, in the frame of the camera: there it
         is not found again after a loss. A `Session` of several objects sets it; None where no other is known.
 
@@ -173,6 +174,7 @@ class Tracker:
         self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
         self._history = StateHistory(camera, self.model.nodes.mean(axis=0))
         self.last_seen: Keyframe | None = None
+        self.last_blurred: Array | None = None
         self._views: ViewSet | None = None
         self._last = self._velocity_base = self._start = registration.state
         self._jumps_before: tuple[DisplacementJump, ...] = ()
@@ -388,6 +390,10 @@ class Tracker:
                 last = None if self._lost else self._beyond
                 self._beyond = self._discrepancy.fit(self.last_measured, hypothesis.estimate.state, last)
                 hypothesis = replace(hypothesis, discrepancy=self._beyond)
+        if not self._lost:
+            with stage("correct"):
+                hypothesis = estimation.with_blur(image, hypothesis, self._last)
+        self.last_blurred = hypothesis.blurred
         if camera.pose_prior is not None and not hypothesis.outline_alone:
             self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
         return hypothesis
@@ -399,7 +405,7 @@ class Tracker:
         if rejection is None:
             self._learn(image, hypothesis)
         else:
-            self.last_measured = self.reference.nothing_measured
+            self.last_measured, self.last_blurred = self.reference.nothing_measured, None
             if self.estimator.loads is not None:
                 self.estimator.loads.forget()
             placed = self._placed_by_map(camera)
@@ -486,7 +492,7 @@ class Tracker:
         self._history.add(None)
         if timestamp is not None:
             self._gaps.after_gap(timestamp)
-        self.last_measured, self._lost = self.reference.nothing_measured, True
+        self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
         self._n_lost += 1
         rejection = Rejection(RejectionReason.NO_PICTURE)
         return FrameResult(self.model, Status.LOST, rejection=rejection, timings_ms=dict.fromkeys(STAGES, 0.0))
