@@ -76,10 +76,12 @@ def test_the_command_prints_the_base_beside_the_error(folder, capsys):
 
 
 def test_a_folder_of_images_is_read_in_its_unit(folder, tmp_path):
-    depth = surface_depth(load_run(folder), 1)
-    cv2.imwrite(str(tmp_path / "depth-11.png"), np.rint(4000.0 * depth).astype(np.uint16))
+    """Where they hold the largest value nothing was measured, as where they hold 0: that is nothing else."""
+    stored = np.rint(4000.0 * surface_depth(load_run(folder), 1)).astype(np.uint16)
+    stored[200:260, 280:340] = 65535
+    cv2.imwrite(str(tmp_path / "depth-11.png"), stored)
     error = depth_error(load_run(folder), read_depths(tmp_path, [10, 11], values_per_metre=4000.0))
-    assert error.frames.tolist() == [11]
+    assert (error.frames.tolist(), error.left_out.tolist()) == ([11], [0.0])
     assert error.compared.max() <= 0.125e-3 + 1e-6  # half of the sensor's step
 
 

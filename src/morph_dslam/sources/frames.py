@@ -168,6 +168,10 @@ def check_size(image: NDArray, size: tuple[int, int] | None, what: str) -> tuple
     return height, width
 
 
+#: Values of 16 bits with which cameras say that they measured nothing: 0, or the largest one, as Kinect drivers do.
+NO_DEPTH = (0, 65535)
+
+
 @dataclass(frozen=True)
 class DepthScale:
     """How a recording stores depth.
@@ -175,12 +179,10 @@ class DepthScale:
     Attributes
     ----------
     values_per_metre : of the stored whole numbers
-    unknown : values that mean it was not measured
     registered : whether depth pixels belong to the colour pixels of the same row and column
     """
 
     values_per_metre: float
-    unknown: tuple[int, ...] = (0,)
     registered: bool = True
 
 
@@ -208,12 +210,12 @@ def turned_deg(path: Path, what: str) -> int:
 
 
 def read_depth(path: Path, what: str, scale: DepthScale) -> NDArray[np.float32]:
-    """Read a depth image (h, w) of one channel of 16 bits in metres, NaN where no depth was measured."""
+    """Read a depth image (h, w) of one channel of 16 bits in metres, NaN where no depth was measured: `NO_DEPTH`."""
     stored = _decode(path, what, cv2.IMREAD_UNCHANGED)
     if stored.ndim != 2 or stored.dtype != np.uint16:
         raise SourceError(f"{what}: {path} is not a depth image, which has one channel of 16 bits")
     depth = stored.astype(np.float32) / np.float32(scale.values_per_metre)
-    depth[np.isin(stored, scale.unknown)] = np.nan
+    depth[(stored == NO_DEPTH[0]) | (stored == NO_DEPTH[1])] = np.nan
     return depth
 
 

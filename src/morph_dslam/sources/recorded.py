@@ -33,7 +33,7 @@ DEPTH_SCALE = (
 )
 #: Colour and depth are not taken at the same instant; these belong together, seconds.
 MOST_TIME_DIFFERENCE = 0.02
-SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, unknown=(0, 65535), registered=False)
+SEVEN_SCENES_DEPTH = DepthScale(values_per_metre=1000.0, registered=False)
 #: 7-Scenes carry no timestamps.
 SEVEN_SCENES_FPS = 30.0
 #: Names of images that are times: seconds with a fraction as of TUM RGB-D, or whole parts of a second, nanoseconds as
