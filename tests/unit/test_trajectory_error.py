@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.clock_offset import clock_offset
 from morph_dslam.evaluation.trajectory import (
     absolute_error,
     associate,
@@ -279,6 +280,40 @@ def test_paths_that_drift_are_not_taken_for_those_of_another_body():
             step[:3, :3] @= Rotation.from_rotvec(0.001 * rng.standard_normal(3)).as_matrix()
             poses.append(poses[-1] @ step)
         assert evaluate_trajectory(Trajectory(truth.timestamps, np.array(poses)), truth)["notes"] == []
+
+
+def wavering(times):
+    """A camera that goes to and fro at speeds that do not repeat within a minute."""
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, 3] = np.column_stack([np.sin(0.9 * times**1.2), 0.6 * np.cos(1.3 * times), 0.3 * np.sin(2.1 * times)])
+    return Trajectory(times, poses)
+
+
+@pytest.mark.parametrize("offset", [5.0, -3.2])
+def test_a_constant_offset_of_the_clocks_is_named_and_changes_no_figure(offset):
+    truth = wavering(np.arange(0.0, 30.0, 0.01))
+    times = np.arange(2.0, 28.0, 1.0 / 30.0)
+    late = Trajectory(times + offset, moved(wavering(times), 2.5).world_from_camera)
+    found, before, after = clock_offset(late, truth)
+    assert found == pytest.approx(-offset, abs=1e-3)
+    assert after < 1e-4 < 0.1 < before
+    own, true = match(late, truth)
+    figures = evaluate_trajectory(late, truth)
+    assert any(f"{-offset:+.3f} s" in note for note in figures["notes"])
+    expected = absolute_error(own, true, with_scale=False).distances
+    assert figures["se3"]["absolute_mm"]["mean"] == pytest.approx(1e3 * float(expected.mean()))
+
+
+def test_paths_on_one_clock_or_of_other_recordings_name_no_offset():
+    truth = wavering(np.arange(0.0, 30.0, 0.01))
+    times = np.arange(2.0, 28.0, 1.0 / 30.0)
+    for late in (0.0, 0.03):
+        assert clock_offset(Trajectory(times + late, moved(wavering(times)).world_from_camera), truth) is None
+    other = wavering(times + 40.0).world_from_camera
+    assert clock_offset(Trajectory(times, other), truth) is None
+    assert clock_offset(helix(n=200, start=2.0), truth) is None  # at a constant speed
+    still = Trajectory(times, np.tile(np.eye(4), (len(times), 1, 1)))
+    assert clock_offset(still, truth) is None
 
 
 def test_stamps_in_nanoseconds_are_not_called_numbers_of_frames():

@@ -24,6 +24,7 @@ from morph_dslam.evaluation.points import MaterialError, millimetres
 from morph_dslam.evaluation.trajectory_notes import (
     check_numbers,
     clock_advice,
+    clock_notes,
     no_scale,
     pair_notes,
     pose_notes,
@@ -188,6 +189,7 @@ def relative_error(estimate: Trajectory, truth: Trajectory, interval: float, sca
 
 #: The relative error is taken over motions this long, seconds, where the trajectory allows it.
 INTERVAL = 1.0
+OTHER_INSTANTS = "poses of other instants have no common scale"
 SCALE_UNKNOWN = (
     "the scale of the run's map is unknown, because one camera cannot measure lengths: there is no ate_se3_mm, and "
     "ate_sim3_mm is what the best scale leaves (truth = scale x estimate)"
@@ -255,7 +257,11 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
             "relative_deg": statistics(np.rad2deg(relative.rotations)),
         }
         errors[name] = absolute, relative
-    mistakes = [*pair_notes(len(estimate), loaded, whole), *pose_notes(estimate, expected)]
+    clocks = list(clock_notes(loaded, whole))
+    # Poses of other instants tell nothing of conventions, nor of a scale.
+    poses = [] if clocks else pose_notes(estimate, expected)
+    mistakes = [*clocks, *pair_notes(len(estimate), loaded, whole), *poses]
+    still = OTHER_INSTANTS if still and clocks else still
     figures["notes"] = [*mistakes, *_scale_notes(figures, bool(mistakes), still, expected)]
     if path is not None:
         with writing(EvaluationError, path.parent):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import EvaluationError
+from morph_dslam.evaluation.clock_offset import clock_offset
 from morph_dslam.geometry import fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, other_conventions
 from morph_dslam.slam.run_notes import LONGEST_INTERVAL_S
@@ -167,6 +168,18 @@ def _lever_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
         yield (
             f"the camera's centre is ({lever}) mm from the point whose path the truth is, in the truth's axes; with it "
             f"the positions differ by {1e3 * after:.2g} mm, not by {1e3 * before:.2g}"
+        )
+
+
+def clock_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
+    """That the clocks of whole paths differ by a constant, where that explains most of the error."""
+    found = clock_offset(estimate, truth)
+    if found is not None:
+        offset, before, after = found
+        yield (
+            f"the clocks differ by a constant: with {offset:+.3f} s on the times of the estimate the positions differ "
+            f"by {1e3 * after:.3g} mm, not by {1e3 * before:.3g} (root mean square, at the best scale). The figures "
+            "are those of the times as they are: correct these"
         )
 
 
