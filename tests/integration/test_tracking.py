@@ -16,7 +16,7 @@ from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import BlurredByMotion, DepthNotUsed, KnownRefuted, RejectionReason
+from morph_dslam.tracking.outcomes import BlurredByMotion, DepthNotUsed, KnownRefuted, ReferenceBlurred, RejectionReason
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.tracker import Tracker
@@ -115,6 +115,22 @@ def test_a_frame_that_motion_blurs_is_named_and_its_deviations_hold_the_error(mo
             assert (np.abs(found.state.parameters - truth.parameters) < 3.0 * found.parameter_std).all()
             apart = found.state.camera_from_object.translation - truth.camera_from_object.translation
             assert (np.abs(apart) < 3.0 * np.sqrt(np.diag(found.covariance)[-3:])).all()
+
+
+@pytest.mark.parametrize("is_blurred", [True, False])
+def test_a_reference_picture_that_motion_blurs_is_named_by_sharp_frames(model, film, is_blurred):
+    """The sheet goes on by about ten pixels in the frame after the reference frame, and then slowly."""
+    exposure = 0.06 * np.linspace(-0.5, 0.5, 15) if is_blurred else np.zeros(1)
+    first = np.mean([film.frame(sheet_state(0.1 + part), noise=0.0) for part in exposure], axis=0)
+    tracker = Tracker(model, CAMERA, Registration(model, sheet_state(0.1)), reference=first.astype(np.uint8))
+    named = []
+    for time in [0.1, 0.17, 0.172, 0.174, 0.176]:
+        frame = first.astype(np.uint8) if time == 0.1 else film.frame(sheet_state(time))
+        result = tracker.track(frame)
+        assert result.status == "tracked", result.reason
+        assert result.warning(BlurredByMotion) is None
+        named.append(result.warning(ReferenceBlurred) is not None)
+    assert any(named) == is_blurred
 
 
 def test_lost_object_says_why_and_is_recovered_elsewhere(model, film):

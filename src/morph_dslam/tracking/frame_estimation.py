@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -20,7 +20,7 @@ from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.known_values import LEAST_SIGMA_PX, KnownParameters
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
-from morph_dslam.tracking.motion_blur import blurred_paths
+from morph_dslam.tracking.motion_blur import ReferenceBlur, blurred_paths, path_length
 from morph_dslam.tracking.noise import (
     Correlation,
     Observations,
@@ -34,6 +34,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import DepthNotUsed
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
+from morph_dslam.tracking.patches import zero_where_unknown
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.row_motion import RowMotion
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
@@ -129,6 +130,7 @@ class FrameEstimation:
     def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
         self._estimator, self._reference, self._options = estimator, reference, options
         self._noise, self._balance = PointNoise(), OutlineBalance()
+        self._reference_blur = ReferenceBlur()
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
@@ -419,13 +421,24 @@ class FrameEstimation:
         )
         return replace(attempt, estimate=estimate)
 
-    def with_blur(self, picture: Image, attempt: PoseHypothesis, last: State) -> PoseHypothesis:
-        """The attempt with the paths over which motion since the ``last`` state blurs the picture."""
+    def with_blur(
+        self, picture: Image, attempt: PoseHypothesis, last: State, warped: Callable[[State, Array], Array] | None
+    ) -> PoseHypothesis:
+        """The attempt with the paths over which motion since the ``last`` state blurs the picture.
+
+        With ``warped``, which leads motions (p, 2) of points in the reference view to a frame, also with what the frame
+        tells of the reference picture.
+        """
         seen, rows = attempt.measurement, attempt.inliers
         if seen.rendered is None or seen.drawing is None:
             return attempt
         places, before = self._reference.projected(seen.drawing.state), self._reference.projected(last)
         rows = rows & np.isfinite(before).all(axis=1)
+        if warped is not None:
+            self._reference_blur.learn(zero_where_unknown(places - before))
+            pictures = seen.rendered, picture.normalized, places, seen.recorded
+            paths = self._reference_blur.paths(lambda ways: warped(attempt.estimate.state, ways), *pictures, rows)
+            attempt = replace(attempt, reference_blur_px=0.0 if paths is None else path_length(paths))
         asked = seen.rendered, picture.normalized, places[rows], seen.recorded[rows], (places - before)[rows]
         if (paths := blurred_paths(*asked)) is None:
             return attempt

@@ -25,6 +25,7 @@ from morph_dslam.tracking.outcomes import (
     OtherReferenceView,
     PastForgotten,
     PoseSource,
+    ReferenceBlurred,
     ReferenceWidened,
     Rejection,
     Status,
@@ -151,6 +152,8 @@ def _with_systematic_errors(
         warnings.append(BlurredByMotion.of(blurred[hypothesis.inliers]))
     elif doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
+    if hypothesis.reference_blur_px:
+        warnings.append(ReferenceBlurred(hypothesis.reference_blur_px))
     beyond = systematic.beyond_reference
     if left.is_failure or (beyond is not None and beyond.is_failure):
         shift_px = systematic.common_shift(hypothesis.estimate, hypothesis.weights)

@@ -82,6 +82,8 @@ class PoseHypothesis:
         asked after a loss only.
     blurred : (p, 2), the paths over which motion smears the points that support it, pixels, see `blurred_paths`; None
         where it does no harm, or is not known.
+    reference_blur_px : the root mean square length of the paths over which motion smears the reference picture, pixels;
+        0 where it does no harm, or is not known.
     """
 
     estimate: Estimate
@@ -95,6 +97,7 @@ class PoseHypothesis:
     discrepancy: Discrepancy | None = None
     n_absent: int = 0
     blurred: Array | None = None
+    reference_blur_px: float = 0.0
 
     @property
     def point_depths(self) -> PointDepths | None:

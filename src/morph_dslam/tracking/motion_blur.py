@@ -11,6 +11,8 @@ distance, is as well explained by averages across the way, and does not count.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -27,6 +29,8 @@ LARGEST_SHARE, N_STEPS = 2.0, 8
 CLEARLY_LESS = 0.9
 #: At most about so many points are asked.
 MOST_ASKED = 20
+#: So many frames tell how the object left the reference picture; where a frame shows it longer by this factor does not.
+FRAMES_AFTER, LARGEST_STRETCH = 2, 1.5
 
 _F32 = np.float32
 
@@ -42,7 +46,7 @@ def blurred_paths(
     places, found : (p, 2) where points are in either, pixels.
     ways : (p, 2) by which they moved since the last frame, pixels.
     """
-    way = float(np.sqrt(np.mean(np.sum(ways**2, axis=1)))) if len(ways) else 0.0
+    way = path_length(ways) if len(ways) else 0.0
     if not LARGEST_SHARE * way > LEAST_PATH_PX:
         return None
     rows = slice(None, None, 1 + (len(ways) - 1) // MOST_ASKED)
@@ -53,6 +57,50 @@ def blurred_paths(
         return None
     across = left_different(rendered, frame, asked[0], asked[1], asked[2] @ np.array([[0.0, 1.0], [-1.0, 0.0]]))
     return share * ways if along.min() < CLEARLY_LESS * across.min() else None
+
+
+def path_length(paths: Array) -> float:
+    """Root mean square length of paths (p, 2), at least one."""
+    return float(np.sqrt(np.mean(np.sum(paths**2, axis=1))))
+
+
+class ReferenceBlur:
+    """Whether motion blurs the reference picture itself, with the motion by which the object left it.
+
+    Where frames, averaged along shares of the way from the reference frame to the next one, become more like the
+    rendered reference view, that is smeared over such paths on the surface.
+    """
+
+    def __init__(self) -> None:
+        self._ways, self._n_frames = np.zeros((0, 2)), 0
+
+    def learn(self, ways: Array) -> None:
+        """Take in by what the points (p, 2) moved since the last frame, pixels, 0 where that is not known.
+
+        The first frame may be the reference frame itself: the second one's count.
+        """
+        if self._n_frames < FRAMES_AFTER:
+            self._ways, self._n_frames = ways, self._n_frames + 1
+
+    def paths(
+        self, warped: Callable[[Array], Array], rendered: NDArray[np.uint8], frame: NDArray[np.uint8],
+        places: Array, found: Array, used: NDArray[np.bool_],
+    ) -> Array | None:  # fmt: skip
+        """The paths (k, 2), pixels, over which the reference picture shows points smeared, as a frame would show them.
+
+        Parameters
+        ----------
+        warped : where motions (p, 2) in the reference view lead to in the frame.
+        rendered, frame, places, found : as of `blurred_paths`, of all points.
+        used : (p,) which of these count.
+        """
+        if self._n_frames < FRAMES_AFTER or not LARGEST_SHARE * path_length(self._ways) > LEAST_PATH_PX:
+            return None
+        ways = warped(self._ways)
+        # Where the frame shows the surface larger, the rendering is softer than the frame whatever moved.
+        larger = np.linalg.norm(ways, axis=1) > LARGEST_STRETCH * np.linalg.norm(self._ways, axis=1)
+        used = used & ~larger & np.isfinite(ways).all(axis=1)
+        return blurred_paths(frame, rendered, found[used], places[used], ways[used])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

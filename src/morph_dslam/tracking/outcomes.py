@@ -146,6 +146,19 @@ class BlurredByMotion(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class ReferenceBlurred(TrackingWarning):
+    """Motion blurs the reference picture, as a frame that is sharper shows.
+
+    Attributes
+    ----------
+    path_px : root mean square length of the points' paths during its exposure, as this frame would show them, pixels.
+    """
+
+    template: ClassVar[str] = "motion blurs the reference picture, over paths of about {path_px:.0f} px"
+    path_px: float
+
+
+@dataclass(frozen=True)
 class SamePlace(TrackingWarning):
     """Two objects of a session stand in one place, which bodies cannot: one of them was taken for the other.
 

@@ -27,6 +27,7 @@ from morph_dslam.tracking.outcomes import (
     ModelDoesNotExplain,
     ObjectMoved,
     ReadoutNotUsed,
+    ReferenceBlurred,
     SamePlace,
     Status,
     TimeOutside,
@@ -63,6 +64,11 @@ class RunWarning(StrEnum):
         "motion blurs the pictures in {count} of {n_frames} frames, first in frame {first}, over paths of up to "
         "{largest_px:.0f} px: deviations there hold that points are measured anywhere on these; for exact ones film "
         "with more light and a shorter exposure, or a slower motion"
+    )
+    REFERENCE_BLURRED = (
+        "motion blurs the reference picture, over paths of up to {largest_px:.0f} px, as {count} of {n_frames} frames "
+        "show that are sharper, first in frame {first}; all frames are measured against it and may be off by "
+        "more than their deviations: take a sharp frame for it (--reference-frame, landmarks in that one)"
     )
     SAME_PLACE = (
         "it stands where '{other}' stands in {count} of {n_frames} frames, first in frame {first}: one of both was "
@@ -251,6 +257,8 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     blurred = _warned(run, BlurredByMotion)
     longest = max((warning.path_px for _, warning in blurred), default=0.0)
     tell(blurred, kind.BLURRED_BY_MOTION, largest_px=longest)
+    soft = _warned(run, ReferenceBlurred)
+    tell(soft, kind.REFERENCE_BLURRED, largest_px=max((warning.path_px for _, warning in soft), default=0.0))
     same = _warned(run, SamePlace)
     for other in sorted({warning.other for _, warning in same}):
         tell([(frame, w) for frame, w in same if w.other == other], kind.SAME_PLACE, other=other)

@@ -455,6 +455,10 @@ class SystematicErrors:
             points.rest, points.field.modes, self._estimator.camera.intrinsics,
         )  # fmt: skip
 
+    def warped(self, state: State, moved: Array) -> Array:
+        """How pixels move (p, 2) in the view of a state where they move by ``moved`` (p, 2) in the reference view."""
+        return self._warped(state, np.ascontiguousarray(moved[:, :, None]))[:, :, 0]
+
     def _warped(self, state: State, moved: Array) -> Array:
         """How pixels move (p, 2, c) in a view where they move by ``moved`` (p, 2, c) in the reference view."""
         pixels = self._estimator.camera.project(self._corners.in_camera(state))

@@ -172,6 +172,7 @@ class Tracker:
             reference, in_sequence = self._from_scene(), False
         self.is_taken: Callable[[State], bool] | None = None
         self._lost, self._n_lost, self._gaps = not in_sequence, 0, FrameGaps()
+        self._in_sequence = in_sequence
         self._history = StateHistory(camera, self.model.nodes.mean(axis=0))
         self.last_seen: Keyframe | None = None
         self.last_blurred: Array | None = None
@@ -392,7 +393,9 @@ class Tracker:
                 hypothesis = replace(hypothesis, discrepancy=self._beyond)
         if not self._lost:
             with stage("correct"):
-                hypothesis = estimation.with_blur(image, hypothesis, self._last)
+                systematic = None if self._view.number or not self._in_sequence else self._view.systematic
+                warped = None if systematic is None else systematic.warped
+                hypothesis = estimation.with_blur(image, hypothesis, self._last, warped)
         self.last_blurred = hypothesis.blurred
         if camera.pose_prior is not None and not hypothesis.outline_alone:
             self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
