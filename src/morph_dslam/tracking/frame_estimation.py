@@ -79,7 +79,9 @@ class ShapeSearch:
         self._next, self._random = 0, np.random.default_rng(0)
 
     def spread(self, estimate: Estimate, count: int) -> list[State]:
-        """The next shapes, so many, of those spread over the box, in the pose of an estimate."""
+        """The next shapes, so many, spread over the box, in the pose of an estimate; none of a rigid object."""
+        if not len(self._model.study_parameters):
+            return []
         rows = (self._next + np.arange(count)) % len(self._shapes)
         self._next = (self._next + count) % len(self._shapes)
         return [replace(estimate.state, parameters=self._shapes[row]) for row in rows]
