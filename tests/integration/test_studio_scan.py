@@ -14,6 +14,8 @@ from tests.support.live_camera import LivePage
 from tests.support.rendered_anchored import FRAMES, SCAN
 from tests.support.studio import Client, running_studio
 
+pytestmark = pytest.mark.slow
+
 #: Frame of the scan in which pairs are set.
 SET_IN = 20
 
@@ -81,7 +83,6 @@ def placed(studio):
     return client.call("scan")
 
 
-@pytest.mark.slow
 def test_the_evidence_of_a_place_is_told(studio, placed):
     place, written = placed["place"], (studio[1] / "place/registration.json").read_text()
     assert placed["map"]["n_tracked"] > 0.8 * SCAN
@@ -93,7 +94,6 @@ def test_the_evidence_of_a_place_is_told(studio, placed):
     assert placed["map"]["keyframes"][0] < SET_IN < placed["map"]["keyframes"][-1] < SCAN
 
 
-@pytest.mark.slow
 def test_the_place_is_drawn_where_the_object_is(studio, placed):
     client, folder, truth = studio
     model, camera = load_model(folder / "model.morph"), load_camera(folder / "camera.yaml")
@@ -114,7 +114,6 @@ def test_the_place_is_drawn_where_the_object_is(studio, placed):
     assert "there is no other place 9" in client.refused("place_overlay", frame=placed["map"]["keyframes"][0], rival=9)
 
 
-@pytest.mark.slow
 def test_an_ambiguous_place_is_accepted_on_purpose(studio, placed):
     client, folder, _ = studio
     assert not client.state()["done"]["start"]
@@ -125,7 +124,6 @@ def test_an_ambiguous_place_is_accepted_on_purpose(studio, placed):
     assert client.state()["done"]["start"]
 
 
-@pytest.mark.slow
 def test_the_video_is_tracked_from_the_place(studio, placed):
     client, folder, truth = studio
     client.call("accept_place", despite_ambiguity=True)
@@ -146,7 +144,6 @@ def test_the_video_is_tracked_from_the_place(studio, placed):
     assert np.median(off) < 3e-3
 
 
-@pytest.mark.slow
 def test_a_live_camera_is_tracked_from_the_place(studio, placed):
     """The frames after the scan come from a camera, each when the picture of the one before has come; no pairs."""
     client, folder, truth = studio
@@ -185,7 +182,6 @@ def test_a_live_camera_is_tracked_from_the_place(studio, placed):
     (folder / "studio.json").write_text(json.dumps(client.state()["choices"] | {"recording": "frames"}))
 
 
-@pytest.mark.slow
 def test_a_place_that_is_written_anew_is_accepted_anew(studio, placed):
     client, folder, _ = studio
     client.call("accept_place", despite_ambiguity=True)
@@ -200,7 +196,6 @@ def test_a_place_that_is_written_anew_is_accepted_anew(studio, placed):
     client.call("start_by", way="scan")
 
 
-@pytest.mark.slow
 def test_another_place_becomes_a_hint(studio, placed):
     """The place that was found is written as a rival; its points are those of the object there."""
     client, folder, truth = studio
