@@ -217,7 +217,7 @@ def identify(
     ------
     IdentificationError
         If a parameter is not the model's, nothing measured depends on one, forces are of another size than any of
-        the model, or loads act to which a factor of all moduli does no justice, or that it takes out of their ranges.
+        the model, or loads act that a factor of all moduli does not scale, or that it takes out of their ranges.
     EvaluationError
         If the force that fits best falls where the measured one grows: it is that in the opposite direction.
     """
