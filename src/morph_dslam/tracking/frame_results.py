@@ -16,6 +16,7 @@ from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.known_check import refuted_values
+from morph_dslam.tracking.motion_blur import path_length
 from morph_dslam.tracking.outcomes import (
     BlurredByMotion,
     CameraLost,
@@ -149,7 +150,7 @@ def _with_systematic_errors(
     estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if blurred is not None:
-        warnings.append(BlurredByMotion.of(blurred[hypothesis.inliers]))
+        warnings.append(BlurredByMotion(path_length(blurred[hypothesis.inliers])))
     elif doubt_px:
         warnings.append(FewPointsAgree(hypothesis.estimate.sigma_px))
     if hypothesis.reference_blur_px:

@@ -10,9 +10,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from morph_dslam.notices import Notice
 
 
@@ -138,11 +135,6 @@ class BlurredByMotion(TrackingWarning):
 
     template: ClassVar[str] = "motion blurs the picture, over paths of about {path_px:.0f} px"
     path_px: float
-
-    @classmethod
-    def of(cls, paths: NDArray[np.float64]) -> BlurredByMotion:
-        """The warning of these paths (p, 2), pixels."""
-        return cls(float(np.sqrt(np.mean(np.sum(paths**2, axis=1)))))
 
 
 @dataclass(frozen=True)
