@@ -86,9 +86,11 @@ def test_a_camera_that_is_turned_is_named_and_a_right_one_is_not():
         assert right.warnings == ()
     off = register_landmarks(MODEL, LEFT.camera, first, others=[(turned(RIGHT, 0.5), second)])
     said = [warning for warning in off.warnings if isinstance(warning, CamerasContradict)]
-    assert said[0].alone_px < 2.0**0.5 * SIGMA < 1.0 < said[0].together_px
+    assert said[0].camera == 1
+    assert 0.7 * SIGMA < said[0].free_px < 1.3 * SIGMA < said[0].together_px
+    assert said[0].turned_deg == pytest.approx(0.5, abs=0.3)
     assert not any(isinstance(warning, PoorFit) for warning in off.warnings)
-    with pytest.raises(RegistrationError, match=r"the cameras contradict each other: .* to 0.* px by themselves"):
+    with pytest.raises(RegistrationError, match=r"the cameras contradict .* camera 1 is turned by about [23] degrees"):
         register_landmarks(MODEL, LEFT.camera, first, others=[(turned(RIGHT, 3.0), second)])
 
 

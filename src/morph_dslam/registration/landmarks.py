@@ -7,7 +7,7 @@ like one away from it) is reported and not chosen by accident.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
@@ -27,7 +27,6 @@ from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
     AtBound,
-    CamerasContradict,
     DepthAgainstLandmarks,
     FewLandmarks,
     NotAtRest,
@@ -41,6 +40,7 @@ from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinc
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
+from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import pose_starts, shape_starts
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
@@ -63,8 +63,6 @@ SPREAD_SHARE, SURFACE_SHARE = 0.12, 0.01
 RESIDUAL_SHARE = 0.005
 #: Both of hints about an object whose edges give its place in the end: they need not be exact, but no mistakes.
 HINT_RESIDUAL_SHARE, HINT_SURFACE_SHARE = 0.02, 0.05
-#: Cameras disagree whose landmarks fit by themselves to this share of how they fit together.
-ALONE_SHARE = 0.5
 #: With fewer numbers to spare, residuals show the error of landmarks to a third at best.
 ENOUGH_SPARE = 6
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
@@ -189,8 +187,8 @@ def register_landmarks(
         notes = (*notes, *measured.notes(best.state, linear, covariance, aids))
     alone_px = facts["sigma_px"] if depth is not None else np.nan
     warnings = _warnings(model, best, len(alternatives), bound.rest, click_px, poor_px, moved, alone_px)
-    if best.sigma_px > poor_px and (contradiction := list(_disagreeing(estimator, bound, pixels, best))):
-        warnings = (*contradiction, *(warning for warning in warnings if not isinstance(warning, PoorFit)))
+    if contradiction := cameras_contradict(estimator, bound, pixels, best, click_px):
+        warnings = (contradiction, *(warning for warning in warnings if not isinstance(warning, PoorFit)))
     warnings = (*warnings, *notes)
     for part, seen in zip(cameras, given, strict=True):
         warnings = (*warnings, *turned_away(model, part.seen(best.state), seen.points))
@@ -396,8 +394,8 @@ def _check_residual(
     rms, limit = _rms(best), share * float(np.hypot(camera.width, camera.height))
     if rms <= limit:
         return
-    for disagreement in _disagreeing(estimator, bound, pixels, best):
-        raise RegistrationError(str(disagreement), RegistrationFailure.LANDMARKS_DO_NOT_FIT)
+    if contradiction := cameras_contradict(estimator, bound, pixels, best, limit, is_far=True):
+        raise RegistrationError(str(contradiction), RegistrationFailure.LANDMARKS_DO_NOT_FIT)
     is_shape_known = np.array_equal(estimator.box.lower, estimator.box.upper)
     wrong = _contradicted(estimator, bound, pixels, limit) if is_shape_known else None
     if wrong is not None:
@@ -417,28 +415,6 @@ def _check_residual(
         f"its pixel, the order of the landmarks, the camera file, and that {shape}{more}",
         RegistrationFailure.LANDMARKS_DO_NOT_FIT,
     )
-
-
-def _disagreeing(
-    estimator: PointsEstimator, bound: BoundPoints, pixels: Array, together: Estimate
-) -> Iterator[CamerasContradict]:
-    """That landmarks of each camera fit the object well by themselves, but not ``together``."""
-    if len(estimator.cameras) == 1:
-        return
-    box, worst = estimator.box, 0.0
-    shapes = [
-        together.state.parameters,
-        *([] if np.array_equal(box.lower, box.upper) else shape_starts(estimator.model)),
-    ]
-    for number in np.unique(estimator.of_points):
-        rows = np.flatnonzero(estimator.of_points == number)
-        if len(rows) < FEWEST_FOR_FIT:
-            continue
-        alone, points, seen = estimator.taking(rows), bound.take(rows), np.ascontiguousarray(pixels[rows])
-        starts = [together.state, *pose_starts(shapes, alone, points, seen)]
-        worst = max(worst, _rms(alone.estimate_from(points, seen, np.ones(len(rows)), starts)[0]))
-    if worst < ALONE_SHARE * _rms(together):
-        yield CamerasContradict(worst, _rms(together))
 
 
 def _contradicted(

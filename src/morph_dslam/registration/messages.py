@@ -142,20 +142,27 @@ class DepthAgainstLandmarks(RegistrationWarning):
 
 @dataclass(frozen=True)
 class CamerasContradict(RegistrationWarning):
-    """The landmarks of each camera of a rig fit the object by themselves, and not all together.
+    """The landmarks of a rig's cameras do not go together with how these stand to each other.
 
     Attributes
     ----------
-    alone_px : root mean square of the residuals of the camera that is worst by itself.
-    together_px : the same of all together.
+    camera : number of the camera whose landmarks are farthest from where its stated pose has them.
+    turned_deg, moved_mm : how far it is from that pose, as the landmarks have it.
+    free_px : standard deviation of a landmark's pixels if the poses of the cameras are free.
+    together_px : the same if they are as stated.
     """
 
     template: ClassVar[str] = (
-        "the cameras contradict each other: their landmarks fit the object to {alone_px:.2g} px by themselves, and to "
-        "{together_px:.2g} px together. Check the poses of the cameras in the camchain, the order of the files, and "
-        "that the pictures are of one instant; until then places are off by more than stated"
+        "the cameras contradict each other: the landmarks fit to {free_px:.2g} px if camera {camera} is turned by about "
+        "{turned_deg:.1g} degrees and moved by {moved_mm:.1g} mm from where the camera file has it, and to "
+        "{together_px:.2g} px as it is there. Check the poses of the cameras in that file, the order of the landmark "
+        "files, that the pictures are of one instant, and the size of the mesh; until then places, parameters and "
+        "forces are off by more than stated"
     )
-    alone_px: float
+    camera: int
+    turned_deg: float
+    moved_mm: float
+    free_px: float
     together_px: float
 
 
