@@ -25,7 +25,7 @@ from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
 from morph_dslam.tracking.outcomes import RejectionReason, SamePlace
 from morph_dslam.tracking.rig import RigCamera
-from morph_dslam.tracking.session import SynchronizedFrames
+from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import (
@@ -508,6 +508,50 @@ def test_frames_that_one_camera_lacks_have_stand_ins(cameras, missing):
             assert {frame.index for frame in stand_ins} == set().union(*cameras) - set(numbers)
             assert not any(frame.image.any() for frame in stand_ins)
         assert both.n_missing == missing
+
+
+class Timed(list[Frame]):
+    """Frames with times of their own, 25 a second."""
+
+    has_assumed_times, fps = False, 25.0
+
+
+def timed(instants, ahead=0.0, seed=0):
+    """Frames numbered from 0 as they come, of these instants of 40 ms by a clock with 3 ms of noise."""
+    noise = 0.003 * np.random.default_rng(seed).uniform(-1.0, 1.0, len(instants))
+    image = np.full((4, 6, 3), 9, dtype=np.uint8)
+    return Timed(Frame(k, 0.04 * n + ahead + e, image) for k, (n, e) in enumerate(zip(instants, noise, strict=True)))
+
+
+@pytest.mark.parametrize("ahead", [0.0, -0.01, 300.0])
+@pytest.mark.parametrize(
+    ("cameras", "together", "missing", "left_out"),
+    [
+        (([0, 1, 2, 3, 4], [0, 1, 3, 4]), [(0, 0), (1, 1), (2, None), (3, 2), (4, 3)], [0, 1], 0),
+        (([0, 1, 3, 4], [0, 1, 2, 3, 4]), [(0, 0), (1, 1), (2, 3), (3, 4)], [1, 0], 1),
+        (([0, 1, 2, 3, 4], [0, 2, 4]), [(0, 0), (1, None), (2, 1), (3, None), (4, 2)], [0, 2], 0),
+        (([0, 1], [0, 1, 2]), [(0, 0), (1, 1), (None, 2)], [1, 0], 0),
+    ],
+)
+def test_frames_go_together_by_their_times(cameras, together, missing, left_out, ahead):
+    """As when a recorder drops messages of one camera: the numbers of its frames go on, and their times tell."""
+    both = SynchronizedFrames([timed(cameras[0]), timed(cameras[1], ahead, seed=1)])
+    for _ in range(2):
+        pairs = list(both)
+        assert [pair[0].index for pair in pairs] == list(range(len(pairs)))
+        for pair, rows in zip(pairs, together, strict=True):
+            for frame, source, row in zip(pair, both.sources, rows, strict=True):
+                assert isinstance(frame, MissingFrame) is (row is None)
+                if row is not None:
+                    assert (frame.timestamp, frame.index) == (source[row].timestamp, pair[0].index)
+        assert (both.n_missing, both.n_left_out) == (missing, left_out)
+
+
+def test_a_camera_whose_first_frame_was_lost_is_paired_by_the_common_clock():
+    both = SynchronizedFrames([timed([0, 1, 2, 3]), timed([1, 2, 3], seed=1)])
+    said = [tuple(None if isinstance(frame, MissingFrame) else frame.timestamp for frame in pair) for pair in both]
+    assert said[0][1] is None
+    assert all(abs(first - second) < 0.01 for first, second in said[1:])
 
 
 @pytest.mark.slow

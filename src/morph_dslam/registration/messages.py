@@ -153,8 +153,8 @@ class CamerasContradict(RegistrationWarning):
     """
 
     template: ClassVar[str] = (
-        "the cameras contradict each other: the landmarks fit to {free_px:.2g} px if camera {camera} is turned by about "
-        "{turned_deg:.1g} degrees and moved by {moved_mm:.1g} mm from where the camera file has it, and to "
+        "the cameras contradict each other: the landmarks fit to {free_px:.2g} px if camera {camera} is turned by "
+        "about {turned_deg:.1g} degrees and moved by {moved_mm:.1g} mm from where the camera file has it, and to "
         "{together_px:.2g} px as it is there. Check the poses of the cameras in that file, the order of the landmark "
         "files, that the pictures are of one instant, and the size of the mesh; until then places, parameters and "
         "forces are off by more than stated"

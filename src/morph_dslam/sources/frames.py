@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -68,6 +68,12 @@ class FrameSource(FrameStream, Protocol):
     def __len__(self) -> int:
         """Number of frames expected; fewer may come when a video is cut short, and then SourceError."""
         ...
+
+
+def usual_rate(timestamps: Sequence[float]) -> float:
+    """Frames per second by the median time between two; 1 for a single frame."""
+    gaps = np.diff(timestamps)
+    return float(1.0 / np.median(gaps)) if len(gaps) and np.median(gaps) > 0.0 else 1.0
 
 
 def check_frame(frame: object, before: Frame | None, source: str) -> None:

@@ -23,6 +23,7 @@ from morph_dslam.sources.frames import (
     read_depth,
     read_image,
     turned_deg,
+    usual_rate,
 )
 
 TUM_DEPTH = DepthScale(values_per_metre=5000.0)
@@ -91,7 +92,7 @@ class RecordedFrames:
             if wanted not in numbers:
                 raise SourceError(f"frame {wanted} is missing from {folder}")
         self.name = str(folder)
-        self.fps = fps or _usual_rate([record.timestamp for record in records])
+        self.fps = fps or usual_rate([record.timestamp for record in records])
         self._records = [record for record in records if low <= record.index <= high]
         self._depth_scale = depth_scale
 
@@ -150,12 +151,6 @@ class RecordedFrames:
                 right = read_image(record.right, what)
                 check_size(right, size, f"{what}: {record.right}")
             yield Frame(record.index, record.timestamp, image, depth, right)
-
-
-def _usual_rate(timestamps: list[float]) -> float:
-    """Frames per second by the median time between two; 1 for a single frame."""
-    gaps = np.diff(timestamps)
-    return float(1.0 / np.median(gaps)) if len(gaps) and np.median(gaps) > 0.0 else 1.0
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:

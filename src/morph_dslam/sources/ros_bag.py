@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +14,14 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError, how_to_install
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.sources.frames import Frame, check_range, check_size
+from morph_dslam.sources.frames import Frame, check_range, check_size, usual_rate
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
+#: So many of the first messages tell the rate.
+N_TIMED = 100
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 #: Channels of 8 bits of each encoding, and OpenCV's conversion to blue, green, red. ROS names a Bayer pattern
 #: by its first two pixels, OpenCV by those of the second row from the second column.
@@ -94,16 +97,18 @@ class RosBag:
     first, last : range of frame numbers, both included; open ends by default
     """
 
+    has_assumed_times = False
+
     def __init__(self, path: Path, first: int | None = None, last: int | None = None) -> None:
         path, topic = _split_topic(path)
         self._path = path
         with _reader(path) as reader:
             connection = _choose_topic(path, reader, topic)
-            seconds = max(reader.duration * 1e-9, 1e-9)
+            begun = islice(reader.messages(connections=[connection]), N_TIMED)
+            self.fps = usual_rate([1e-9 * received for _, received, _ in begun])
         self._topic = connection.topic
         self._first, self._last = check_range(path, range(connection.msgcount), first, last)
         self.name = f"{path}#{self._topic}"
-        self.fps = max(connection.msgcount - 1, 1) / seconds
 
     def __len__(self) -> int:
         return self._last - self._first + 1

@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
-from itertools import islice
 
-import numpy as np
 from tqdm import tqdm
 
-from morph_dslam.errors import ArgumentError, SourceError, check_kind
+from morph_dslam.errors import ArgumentError, check_kind
 from morph_dslam.sources import Frame
-from morph_dslam.sources.frames import FrameSource, MissingFrame, check_frame
+from morph_dslam.sources.frames import check_frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
@@ -20,7 +18,6 @@ from morph_dslam.tracking.live import LivePipeline
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
 from morph_dslam.tracking.reregistration import Reregistration
-from morph_dslam.tracking.run_notices import RunNotice, RunWarning
 from morph_dslam.tracking.sinks import LivePicture, Sink, TrackedFrame
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from morph_dslam.tracking.tracker_inputs import Picture
@@ -161,106 +158,3 @@ class Session:
     def _hand_out(self, tracked: TrackedFrame) -> None:
         for sink in self._sinks:
             sink(tracked)
-
-
-class SynchronizedFrames:
-    """What several cameras recorded, the frames of one instant after the other.
-
-    Where some of them lack the frame of an instant, a `MissingFrame` stands for it. It ends with the longest recording.
-
-    Parameters
-    ----------
-    sources : by camera; frames of one instant have the same number, and all begin with the same one.
-
-    Attributes
-    ----------
-    n_instants : number of instants in the last pass so far.
-    n_missing : by camera, how many of these it has no frame of.
-    """
-
-    def __init__(self, sources: Sequence[FrameSource]) -> None:
-        self.sources, self.n_instants, self.n_missing = tuple(sources), 0, [0] * len(sources)
-
-    def notices(self) -> list[RunNotice]:
-        """What a reader must know if not all recordings have the same frames."""
-        lacking = {number: count for number, count in enumerate(self.n_missing) if count}
-        if not lacking:
-            return []
-        told = ", ".join(f"camera {number} lacks {count}" for number, count in lacking.items())
-        return [RunNotice.of(RunWarning.UNEQUAL_RECORDINGS, instants=self.n_instants, missing=told)]
-
-    @property
-    def turned_deg(self) -> int:
-        """By how many degrees the first camera's frames are turned to be shown."""
-        return getattr(self.sources[0], "turned_deg", 0)
-
-    @property
-    def has_assumed_times(self) -> bool:
-        """Whether nothing tells the times of the first camera's frames, which count."""
-        return getattr(self.sources[0], "has_assumed_times", False)
-
-    @property
-    def has_registered_depth(self) -> bool:
-        """Whether the first camera's frames come with depth that belongs to their pixels."""
-        return getattr(self.sources[0], "has_registered_depth", False)
-
-    def __len__(self) -> int:
-        """Number of instants; there are more where no camera has all."""
-        return max(len(source) for source in self.sources)
-
-    def __iter__(self) -> Iterator[tuple[Frame, ...]]:
-        readers = [iter(source) for source in self.sources]
-        self.n_instants, self.n_missing = 0, [0] * len(readers)
-        come = [frame for reader in readers for frame in islice(reader, 1)]
-        if len(come) < len(readers):
-            return
-        _check_begin(come)
-        blank, clocks = [np.zeros_like(frame.image) for frame in come], _Clocks(come)
-        waiting: list[Frame | None] = [*come]
-        while any(frame is not None for frame in waiting):
-            number = min(frame.index for frame in waiting if frame is not None)
-            now = [frame if frame is not None and frame.index == number else None for frame in waiting]
-            times = clocks.times(now)
-            self.n_instants += 1
-            for k, frame in enumerate(now):
-                self.n_missing[k] += frame is None
-            stand_ins = [MissingFrame(number, time, image) for time, image in zip(times, blank, strict=True)]
-            yield tuple(stand_in if frame is None else frame for frame, stand_in in zip(now, stand_ins, strict=True))
-            waiting = [
-                old if new is None else next(reader, None)
-                for old, new, reader in zip(waiting, now, readers, strict=True)
-            ]
-
-
-class _Clocks:
-    """The times of an instant by the clock of each camera, also where it has no frame of it.
-
-    Parameters
-    ----------
-    frames : by camera, of one instant.
-    """
-
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self._behind = [frame.timestamp - frames[0].timestamp for frame in frames]
-
-    def times(self, frames: Sequence[Frame | None]) -> list[float]:
-        """Seconds, by camera, of an instant of which at least one has a frame."""
-        seen = ((k, frame.timestamp) for k, frame in enumerate(frames) if frame is not None)
-        which, time = next(seen)
-        first = time - self._behind[which]
-        if which == 0:
-            self._behind = [
-                old if frame is None else frame.timestamp - first
-                for old, frame in zip(self._behind, frames, strict=True)
-            ]
-        return [first + behind for behind in self._behind]
-
-
-def _check_begin(frames: Sequence[Frame]) -> None:
-    """Raise SourceError if the first frames of cameras have not one number."""
-    if len({frame.index for frame in frames}) > 1:
-        numbers = ", ".join(str(frame.index) for frame in frames)
-        raise SourceError(
-            f"the cameras' recordings do not go together: they begin with frames {numbers}; number "
-            "what was taken at one instant alike, or if one begins later, give --range from where all begin"
-        )

@@ -52,11 +52,12 @@ from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.run_folder import RunFolder
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.session import Session, SynchronizedFrames
+from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
 from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
 from morph_dslam.tracking.still_run import OpenedSurface, Sharpening, known_state, with_pose, with_still_pose
 from morph_dslam.tracking.stream_sink import StreamedObject, StreamSink
+from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 
 Tell = Callable[[Path, dict[str, Any]], object]
