@@ -95,6 +95,17 @@ def test_stated_deviations_are_those_of_the_errors_and_a_frame_of_another_instan
     assert rig.deviations[1, 0] < 0.3e-3
 
 
+def test_pictures_that_are_all_a_frame_late_give_no_camera_file(filmed, tmp_path):
+    """Of a board that is somewhere else in each frame."""
+    late = tmp_path / "late"
+    late.mkdir()
+    for frame in range(11):
+        (late / f"{frame:02}.png").symlink_to(filmed / "1" / f"{frame + 1:02}.png")
+    with pytest.raises(CameraError, match="do not go together: the residual of .* pixels is large"):
+        calibrate_rig([[filmed / "0"], [late]], MARKERS, tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
+
+
 def test_what_cannot_be_a_rig_is_refused(filmed, tmp_path):
     with pytest.raises(CameraError, match="turned by half a turn"):
         calibrate_rig([[filmed / "0"], [filmed / "1"]], Board(8, 6, 0.028))

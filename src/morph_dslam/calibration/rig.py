@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 FEWEST_SHARED = 3
 #: A larger residual than this, pixels, says that frames of one number do not belong together.
 LARGE_RMS = 1.0
+#: Above this residual, pixels, the cameras' poses are of no use, and none is written.
+USELESS_RMS = 10.0
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,19 @@ class RigCalibration:
         if self.left_out:
             said.append(f"frames that do not fit the others were left out: {', '.join(map(str, self.left_out))}")
         if self.rms_px > LARGE_RMS:
-            said.append(
-                f"the residual of {self.rms_px:.2f} pixels is large: frames of one number are to be of one instant; "
-                "hold the board still, or start the cameras together"
-            )
+            said.append(self._large())
         return said
+
+    def _large(self) -> str:
+        return (
+            f"the residual of {self.rms_px:.2f} pixels is large: frames of one number are to be of one instant; "
+            "hold the board still, or start the cameras together"
+        )
+
+    def check(self) -> None:
+        """Raise CameraError if the cameras' views of the board contradict each other."""
+        if self.rms_px > USELESS_RMS:
+            raise CameraError(f"the cameras' views of the board do not go together: {self._large()}")
 
     def table(self) -> str:
         """Where each camera is, by the one before it."""
@@ -105,7 +115,8 @@ def calibrate_rig(
     lens_model : of all cameras.
 
     Raises CameraError as `calibrate`, and if the board has no orientation, two images of a camera have one number or
-    one has none, or a camera shares too few frames with the others. Raises SourceError as `calibrate`.
+    one has none, a camera shares too few frames with the others, or what they saw is not of the same instants. Raises
+    SourceError as `calibrate`.
     """
     if not board.has_one_orientation:
         raise CameraError(
@@ -122,6 +133,7 @@ def calibrate_rig(
         cameras.append(Calibration(solve_intrinsics(best.views, board, best.size, lens_model), best, board, picture))
         seen.append(_by_number(_with_shape(found.views, cameras[0].solution.shape)))
     rig = _solve(cameras, seen)
+    rig.check()
     if output is not None:
         lenses = [calibration.solution.camera for calibration in cameras]
         with writing(CameraError, Path(output)):

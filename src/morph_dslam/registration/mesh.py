@@ -144,7 +144,8 @@ class MeshRegistration:
         """What a reader must know."""
         warnings: list[RegistrationWarning] = []
         if self.outline.contradicts or self._lacks_edges:
-            warnings.append(OutlineElsewhere(self.outline.share if self.edges is None else self.edges.share))
+            by_edges = self.edges if self._lacks_edges else None
+            warnings.append(OutlineElsewhere(self.outline.share if by_edges is None else by_edges.gain))
         elif self.unconfirmed:
             warnings.append(Ambiguous(Ambiguity.UNCONFIRMED))
         elif self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX:

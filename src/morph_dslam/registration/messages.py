@@ -384,12 +384,13 @@ class OutlineElsewhere(RegistrationWarning):
 
     Attributes
     ----------
-    share : of the outline that is where the registration has it.
+    share : of the outline that is where the registration has it, beyond what lies on edges by chance.
     """
 
     template: ClassVar[str] = (
-        "registration doubtful: the keyframes show only {share:.0%} of the object's outline where it is; it may be "
-        "the mesh of another object, and the size of the map's unit wrong; look at registration.jpg"
+        "registration doubtful: the keyframes show only {share:.0%} of the object's outline where it is, beyond "
+        "what lies on edges by chance; it may be the mesh of another object, and the size of the map's unit wrong; "
+        "look at registration.jpg"
     )
     share: float
 
