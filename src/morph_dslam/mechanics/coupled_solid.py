@@ -116,6 +116,9 @@ class CoupledSolid(SolidProblem):
     def prescribed_slopes(self, mu: Array) -> Array:
         return self._with_motions(super().prescribed_slopes(mu))
 
+    def prescribed_on_the_way(self, x: Array, mu: Array, share: float) -> Array:
+        return self._with_motions(super().prescribed_on_the_way(x, mu, share))
+
     def residual(self, x: Array, mu: Array) -> Array:
         self._set(mu)
         placed = self._placed(x)

@@ -89,6 +89,7 @@ class AveragedNormals:
     order : polynomial degree of the normals along an edge.
     state : the displacement (grid function) at which they are averaged.
     held : supports with the edges (numbers) that they hold.
+    turned : the share of the angle that supports turn by.
 
     Attributes
     ----------
@@ -96,8 +97,14 @@ class AveragedNormals:
     """
 
     def __init__(
-        self, mesh: ngs.Mesh, order: int, state: ngs.GridFunction, held: Sequence[tuple[HoldsDirection, list[int]]]
+        self,
+        mesh: ngs.Mesh,
+        order: int,
+        state: ngs.GridFunction,
+        held: Sequence[tuple[HoldsDirection, list[int]]],
+        turned: Any,
     ) -> None:
+        self._turned = turned
         self._everywhere = mesh.Boundaries(".*")
         space = ngs.VectorFacetSurface(mesh, order=order)
         self._current, self._reference = ngs.GridFunction(space), ngs.GridFunction(space)
@@ -114,7 +121,9 @@ class AveragedNormals:
     @property
     def current(self) -> Any:
         """The averaged normals, or what supports prescribe: an expression of the parameters."""
-        return self._with_held(unit(self._current), lambda support, n: support.edge_normal(self.reference, n))
+        return self._with_held(
+            unit(self._current), lambda support, n: support.edge_normal(self.reference, n, self._turned)
+        )
 
     @property
     def reference(self) -> Any:

@@ -115,8 +115,11 @@ class ShellProblem(SolidProblem):
         self.constraints.check_rigid_motions(np.hstack([np.zeros(axes.shape), axes]), hanging)
         self._state = ngs.GridFunction(self.space)
         self._drag, self._anchor = ngs.Parameter(0.0), ngs.GridFunction(self.displacements.vector)
+        self._turned = ngs.Parameter(1.0)
         held = self._held_edges(directed)
-        self._normals = AveragedNormals(self.geometry.ngs, self.options.order - 1, self._state.components[0], held)
+        self._normals = AveragedNormals(
+            self.geometry.ngs, self.options.order - 1, self._state.components[0], held, self._turned
+        )
         self.assembly = _ShellAssembly(self.space, self._terms(), self.symbols, self.refresh_normals)
         self._held_rotations = self._rotation_dofs([edge for _, edges in held for edge in edges])
         self.free: NDArray[np.bool_] = self._free_dofs()
@@ -236,6 +239,12 @@ class ShellProblem(SolidProblem):
         self._drag.Set(drag)
         self._anchor.vec.FV().NumPy()[:] = x[: 3 * self.displacements.n_scalar]
         self._latest = None
+
+    def turn_directions(self, share: float) -> None:
+        """Turn the directions that supports hold by that share of the angle that parameters give."""
+        if share != self._turned.Get():
+            self._turned.Set(share)
+            self._latest = None
 
     def refresh_normals(self, x: Array) -> None:
         """Average the edge normals at the solution ``x`` (n,), at the parameters' present values."""

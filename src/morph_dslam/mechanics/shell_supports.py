@@ -30,8 +30,11 @@ class HoldsDirection(Protocol):
         """The normal that is held of the undeformed shell, from that of its cells; not of unit length."""
         ...
 
-    def edge_normal(self, undeformed: Any, averaged: Any) -> Any:
-        """The normal that is held, from the undeformed one and from that of the cells; not of unit length."""
+    def edge_normal(self, undeformed: Any, averaged: Any, share: Any) -> Any:
+        """The normal that is held, from the undeformed one and from that of the cells; not of unit length.
+
+        It has turned by that ``share`` of the angle that the support turns it by.
+        """
         ...
 
 
@@ -42,11 +45,12 @@ class Clamp(RigidRotation):
     def undeformed_normal(self, averaged: Any) -> Any:
         return averaged
 
-    def edge_normal(self, undeformed: Any, averaged: Any) -> Any:
+    def edge_normal(self, undeformed: Any, averaged: Any, share: Any) -> Any:
         x, y, z = np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)
         cross = cross_matrix(x, y, z)
         matrices = [ngs.CF(tuple(m.ravel()), dims=(3, 3)) for m in (np.eye(3), cross, cross @ cross)]
-        turn = matrices[0] + ngs.sin(self.angle) * matrices[1] + (1.0 - ngs.cos(self.angle)) * matrices[2]
+        angle = share * self.angle
+        turn = matrices[0] + ngs.sin(angle) * matrices[1] + (1.0 - ngs.cos(angle)) * matrices[2]
         return turn * undeformed
 
 
@@ -87,7 +91,7 @@ class SymmetryPlane:
         across = ngs.CF(tuple(np.eye(3)[self.axis]))
         return averaged - (averaged * across) * across
 
-    def edge_normal(self, undeformed: Any, averaged: Any) -> Any:
+    def edge_normal(self, undeformed: Any, averaged: Any, share: Any) -> Any:
         return self.undeformed_normal(averaged)
 
 

@@ -39,7 +39,7 @@ from morph_dslam.mechanics.solvers.linear_solver import LinearSolver, SolverMake
 from morph_dslam.mechanics.solvers.newton import Linearisation, State
 from morph_dslam.mechanics.spaces import DisplacementSpace, default_order
 from morph_dslam.mechanics.support_forces import SupportForces
-from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion
+from morph_dslam.mechanics.supports import Constraints, ElasticFoundation, PrescribedMotion, largest_turn
 from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
 
@@ -372,6 +372,27 @@ class SolidProblem:
     def strides(self, begin: Array, end: Array) -> int:
         """See `continuation.advance`."""
         return self.contact.strides(begin, end) if self.contact else 1
+
+    def turn(self, begin: Array, end: Array) -> float:
+        """See `newton.turn`."""
+        rotations = []
+        for mu in (begin, end):
+            self.symbols.set(mu)
+            rotations.append(self.constraints.rotations())
+        return largest_turn(rotations[1] - rotations[0])
+
+    def turn_from(self, x: Array, mu: Array) -> float:
+        """See `continuation.loaded_state`: by which supports at rest in ``x`` (n_dofs,) turn up to ``mu`` (d,), rad."""
+        self.symbols.set(mu)
+        return largest_turn(self.constraints.resting_rotations(x[: 3 * self.displacements.n_scalar]))
+
+    def prescribed_on_the_way(self, x: Array, mu: Array, share: float) -> Array:
+        """(n_dofs,) values at prescribed dofs on that share of the way from ``x`` (n_dofs,) to ``mu`` (d,)."""
+        self.symbols.set(mu)
+        return self._padded(self.constraints.values_on_the_way(x[: 3 * self.displacements.n_scalar], share))
+
+    def turn_directions(self, share: float) -> None:
+        """See `continuation.loaded_state`: a solid's supports hold places alone."""
 
     def _set(self, mu: Array) -> None:
         self.symbols.set(mu)

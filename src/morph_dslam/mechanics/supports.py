@@ -63,6 +63,36 @@ class Constraints:
             result[component, dofs] = rigid + self._constant[dofs] * affine.shift[component]
         return result.ravel()
 
+    def values_on_the_way(self, begin: Array, share: float) -> Array:
+        """(3 n_scalar,) prescribed values on that share of the way from ``begin`` (3 n_scalar,) to `values`.
+
+        A set that a rotation moves, and that is at rest at the beginning, goes on its arc; all else goes straight.
+        """
+        way = np.where(self.held, begin + share * (self.values() - begin), 0.0).reshape(3, -1)
+        coordinates = self._shape.coordinates(self._symbols)
+        for motion, component, dofs in self._resting_rotations(begin):
+            affine = motion.part(self._symbols, share).motion(self._symbols, *self._centroid(motion))
+            rigid = coordinates[dofs] @ affine.matrix[component]
+            way[component, dofs] = rigid + self._constant[dofs] * affine.shift[component]
+        return way.ravel()
+
+    def _resting_rotations(self, x: Array) -> list[tuple[RigidRotation, int, Indices]]:
+        """The parts of rotations whose sets are at rest in ``x`` (3 n_scalar,)."""
+        by_component = x.reshape(3, -1)
+        moved = {id(motion) for motion, component, dofs in self._parts if by_component[component, dofs].any()}
+        parts = [part for part in self._parts if id(part[0]) not in moved]
+        return [(motion, component, dofs) for motion, component, dofs in parts if isinstance(motion, RigidRotation)]
+
+    def rotations(self) -> Array:
+        """(k, 3) rotation vectors of the sets that rotations move at the present parameters, rad."""
+        turning = [motion for motion in self._motions if isinstance(motion, RigidRotation)]
+        return np.array([motion.vector(self._symbols) for motion in turning]).reshape(-1, 3)
+
+    def resting_rotations(self, x: Array) -> Array:
+        """Those (k, 3) of `rotations` whose sets are at rest in ``x`` (3 n_scalar,)."""
+        turning = {id(motion): motion for motion, _, _ in self._resting_rotations(x)}
+        return np.array([motion.vector(self._symbols) for motion in turning.values()]).reshape(-1, 3)
+
     def slopes(self) -> Array:
         """(d, 3 n_scalar) derivatives of `values` by the parameters."""
         result = np.zeros((len(self._symbols), 3, self._space.n_scalar))
@@ -236,6 +266,12 @@ def held_still(support: PrescribedMotion | ElasticFoundation) -> PrescribedMotio
     return support  # a foundation or a plane of symmetry stays where it is
 
 
+def largest_turn(vectors: Array) -> float:
+    """Largest angle, rad, by which rotation vectors (k, 3) turn one set against another, or one against space."""
+    every = np.concatenate([vectors, np.zeros((1, 3))])
+    return float(np.linalg.norm(every[:, None] - every, axis=-1).max())
+
+
 def cross_matrix(x: float, y: float, z: float) -> Array:
     """(3, 3) with which the cross product of a vector from the left is taken."""
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -273,6 +309,15 @@ class RigidRotation:
         if self.centre is None:
             return self.on
         return self.centre if isinstance(self.centre, str) else None
+
+    def vector(self, symbols: ParameterSymbols) -> Array:
+        """Rotation vector (3,), rad, at the present parameters: its length is the angle, over whole turns too."""
+        return symbols.value(self.angle) * np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)
+
+    def part(self, symbols: ParameterSymbols, share: float) -> RigidRotation:
+        """The motion by that share of the angle and of the translation at the present parameters."""
+        translation = tuple(share * symbols.value(value) for value in self.translation)
+        return replace(self, angle=share * symbols.value(self.angle), translation=translation)
 
     def motion(self, symbols: ParameterSymbols, centroid: Array, centroid_slopes: Array) -> AffineMotion:
         x, y, z = np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)

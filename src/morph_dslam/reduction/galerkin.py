@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers.continuation import PathError, advance
-from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, in_contact, solve, where
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, in_contact, solve, turn, where
 from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import fit_functions
 from morph_dslam.studies.problem import SweepProblem
@@ -104,6 +104,10 @@ class GalerkinEquations:
     def state_text(self, mu: Array) -> str:
         """A state (d,) for messages."""
         return where(self.full, mu)
+
+    def turn(self, begin: Array, end: Array) -> float:
+        """See `newton.turn`."""
+        return turn(self.full, begin, end)
 
     def prescribed(self, mu: Array) -> Array:
         return np.zeros(self.n_dofs)

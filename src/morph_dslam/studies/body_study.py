@@ -185,10 +185,16 @@ def reader_of(symbols: ParameterSymbols) -> Reader:
 
 
 def support_content(supports: Sequence[Any], mesh: Mesh) -> dict[str, str]:
-    """What a fingerprint says of how forces are given to supports, where earlier versions gave them otherwise.
+    """What a fingerprint says of supports, where earlier versions solved or gave them forces otherwise.
 
-    They gave each support all that is held at its nodes, by whichever support, and foundations nothing.
+    They gave each support all that is held at its nodes, by whichever support, and foundations nothing; and they turned
+    supports by more than half a turn at once.
     """
+    turns = any(support.kind == "rotation" for support in supports)
+    return _reaction_content(supports, mesh) | ({"turns": "in parts"} if turns else {})
+
+
+def _reaction_content(supports: Sequence[Any], mesh: Mesh) -> dict[str, str]:
     if any(support.kind == "foundation" for support in supports):
         return {"reactions": "of each support alone"}
     nodes = [mesh.set_nodes(name) for name in dict.fromkeys(support.on for support in supports)]

@@ -21,7 +21,14 @@ from morph_dslam.mechanics.solvers.continuation import (
     refuse_passage,
     stable_state,
 )
-from morph_dslam.mechanics.solvers.newton import Linearisation, State, sensitivities, solve, solve_with_kept_tangent
+from morph_dslam.mechanics.solvers.newton import (
+    Linearisation,
+    State,
+    refuse_large_turn,
+    sensitivities,
+    solve,
+    solve_with_kept_tangent,
+)
 from morph_dslam.mechanics.solvers.stability import unstable_directions
 from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 from morph_dslam.studies.problem import Snapshot
@@ -230,6 +237,7 @@ class SolidSweep:
         predicted = start.dofs + (target - start.mu) @ start.slopes
         tangent, self._kept = self._tangent_at(start.mu), None
         try:
+            refuse_large_turn(self.problem, start.mu, target)
             state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
             state = state or solve(self.problem, target, State(target, predicted))
             refuse_passage(self.problem, State(start.mu, start.dofs), state)

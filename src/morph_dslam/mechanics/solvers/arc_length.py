@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, correction, size, where
+from morph_dslam.mechanics.solvers.newton import (
+    Equations,
+    Linearisation,
+    State,
+    correction,
+    refuse_large_turn,
+    size,
+    where,
+)
 
 Array = NDArray[np.float64]
 
@@ -180,8 +188,12 @@ class ArcLength:
         return State(mu, x)
 
     def step(self, point: PathPoint, length: float) -> PathPoint:
-        """One step of ``length`` along the path; SolverError if its corrections do not converge."""
+        """One step of ``length`` along the path.
+
+        Raises SolverError if its corrections do not converge, or supports turn by too much (`newton.LARGEST_TURN`).
+        """
         x, mu, count = self._correct(point, length)
+        refuse_large_turn(self.equations, point.state.mu, mu)
         following = self._point(
             x,
             mu,

@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.solvers.arc_length import ArcLength, PathPoint
 from morph_dslam.mechanics.solvers.newton import (
+    LARGEST_TURN,
     TOLERANCE,
     Equations,
     Linearisation,
     State,
     in_contact,
+    refuse_large_turn,
     size,
     solve,
+    turn,
     where,
 )
 
@@ -36,6 +39,8 @@ SMALLEST_INCREMENT = 1.0 / 64.0
 MOST_POINTS = 150
 #: Where it has passed a bifurcation, it is tried again in steps of this part, so many times.
 RETREAT, MOST_RETREATS = 0.25, 5
+#: Step of differences by the share of all loads.
+SLOPE_STEP = 1e-5
 LIMIT_POINT = (
     "A load that the body cannot carry (a limit point) needs arc length, or an imposed displacement in its place"
 )
@@ -46,6 +51,26 @@ class _History(Protocol):
     """Equations whose response depends on the path (internal variables): each accepted solution advances it."""
 
     def advance_history(self, x: Array, mu: Array) -> None: ...
+
+
+@runtime_checkable
+class _Turning(Equations, Protocol):
+    """Equations with prescribed rotations, which grow by their angles while a body is loaded for the first time."""
+
+    def turn_from(self, x: Array, mu: Array) -> float:
+        """Angle, rad, by which supports that are at rest in ``x`` (n,) turn on the way to parameters (d,)."""
+        ...
+
+    def prescribed_on_the_way(self, x: Array, mu: Array, share: float) -> Array:
+        """(n,) values at prescribed dofs on that share of the way from ``x`` (n,) to parameters (d,), 0 at free ones.
+
+        Supports at rest in ``x`` turn by that share of their angle.
+        """
+        ...
+
+    def turn_directions(self, share: float) -> None:
+        """Turn directions that supports hold by that share of the angle that parameters give, until told otherwise."""
+        ...
 
 
 class PassageError(SolverError):
@@ -149,7 +174,8 @@ def advance(
     """Solve at ``target``, along straight lines, in increments as large as converge.
 
     Equations with moving obstacles have a method ``strides`` of two parameter points: in how many parts of the line
-    between them no obstacle moves by more than its radius. Increments may be as much smaller.
+    between them no obstacle moves by more than its radius. Increments may be as much smaller. No increment turns
+    supports by more than `newton.LARGEST_TURN`.
 
     Raises PathError naming the last parameters that converged; it carries the states up to there.
 
@@ -194,11 +220,14 @@ class _Path:
         """Go on to the parameters ``goal`` (d,), the ``number``-th target, along a straight line."""
         origin = self.states[-1].mu
 
-        def attempt(fraction: float, _: State) -> State:
-            return self._step(origin + fraction * (goal - origin), number + fraction)
+        def attempt(fraction: float, before: State) -> State:
+            mu = origin + fraction * (goal - origin)
+            refuse_large_turn(self._equations, before.mu, mu)
+            return self._step(mu, number + fraction)
 
         strides = getattr(self._equations, "strides", None)
-        step_towards(attempt, self.states[-1], 1 if strides is None else strides(origin, goal))
+        turns = int(np.ceil(turn(self._equations, origin, goal) / LARGEST_TURN - 1e-9))
+        step_towards(attempt, self.states[-1], max(1 if strides is None else strides(origin, goal), turns))
 
     def _step(self, mu: Array, place: float) -> State:
         state = self._solve(mu, self._expected.at(place))
@@ -245,16 +274,30 @@ class _LoadRamp:
 
     The residual r(x) - (1 - s) r(start) is that of the share s of every missing dead load (Newton's homotopy; Allgower
     and Georg, Numerical Continuation Methods, 1990, section 1.2): ``start`` solves it at s = 0, and s = 1 is the
-    problem itself.
+    problem itself. Prescribed rotations turn by the share s of their angle. `end` is due when the ramp is left.
     """
 
     def __init__(self, equations: Equations, full: Array, start: Array) -> None:
         self._equations, self._full = equations, full
         self.n_dofs, self.free, self.scale = equations.n_dofs, equations.free, equations.scale
         self.in_contact = in_contact(equations)
+        self._turning = equations if isinstance(equations, _Turning) else None
+        self._turn = self._turning.turn_from(start, full) if self._turning else 0.0
+        self._turn_directions(0.0)
         self._missing = np.where(self.free, equations.residual(start, full), 0.0)
         self._begin = np.where(self.free, 0.0, start)
         self._motion = equations.prescribed(full) - self._begin
+
+    def _turn_directions(self, share: float) -> None:
+        if self._turning and self._turn:
+            self._turning.turn_directions(share)
+
+    def end(self) -> None:
+        """Leave the equations as they were."""
+        self._turn_directions(1.0)
+
+    def turn(self, begin: Array, end: Array) -> float:
+        return float(abs(end[0] - begin[0])) * self._turn
 
     def state_text(self, mu: Array) -> str:
         return f"{100.0 * mu[0]:.4g} % of all loads at {where(self._equations, self._full)}"
@@ -265,18 +308,27 @@ class _LoadRamp:
         return None if passage is None else passage(*ends)
 
     def prescribed(self, mu: Array) -> Array:
+        if self._turning and self._turn:
+            return self._turning.prescribed_on_the_way(self._begin, self._full, float(mu[0]))
         return self._begin + mu[0] * self._motion
 
     def prescribed_slopes(self, mu: Array) -> Array:
-        return self._motion[None]
+        return self._slope(self.prescribed, mu) if self._turn else self._motion[None]
 
     def residual(self, x: Array, mu: Array) -> Array:
+        self._turn_directions(float(mu[0]))
         return self._equations.residual(x, self._full) - (1.0 - mu[0]) * self._missing
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
-        return self._missing[None]
+        return self._slope(lambda share: self.residual(x, share), mu) if self._turn else self._missing[None]
+
+    @staticmethod
+    def _slope(function: Callable[[Array], Array], mu: Array) -> Array:
+        """(1, n) by central differences: sines of angles of a few turns are exact to 1e-8 or so."""
+        return ((function(mu + SLOPE_STEP) - function(mu - SLOPE_STEP)) / (2.0 * SLOPE_STEP))[None]
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
+        self._turn_directions(float(mu[0]))
         original = self._equations.linearise(x, self._full)
         return _Shifted(original, original.residual - (1.0 - mu[0]) * self._missing)
 
@@ -284,7 +336,8 @@ class _LoadRamp:
 def loaded_state(equations: Equations, mu: Array, start: Array | None = None, tolerance: float = TOLERANCE) -> State:
     """Equilibrium at ``mu`` (d,), reached from the undeformed, stress-free body while all loads grow together.
 
-    Raises SolverError if the loads cannot be carried.
+    Prescribed rotations of sets that are at rest grow by their angles, not along the chords of their arcs. Raises
+    SolverError if the loads cannot be carried.
 
     Parameters
     ----------
@@ -295,7 +348,11 @@ def loaded_state(equations: Equations, mu: Array, start: Array | None = None, to
     if start is None:
         first = getattr(equations, "applied_first", None)
         start = np.zeros(equations.n_dofs) if first is None else loaded_state(first(), mu).dofs
-    reached = advance(_LoadRamp(equations, mu, start), State(np.zeros(1), start), np.ones(1), tolerance)[-1]
+    ramp = _LoadRamp(equations, mu, start)
+    try:
+        reached = advance(ramp, State(np.zeros(1), start), np.ones(1), tolerance)[-1]
+    finally:
+        ramp.end()
     return State(np.array(mu, dtype=float), reached.dofs, reached.negative_pivots, reached.iterations)
 
 
@@ -308,6 +365,9 @@ class _Line:
 
     def _at(self, mu: Array) -> Array:
         return self._begin + mu[0] * self._way
+
+    def turn(self, begin: Array, end: Array) -> float:
+        return turn(self._equations, self._at(begin), self._at(end))
 
     def prescribed(self, mu: Array) -> Array:
         return self._equations.prescribed(self._at(mu))
@@ -338,13 +398,19 @@ def stable_state(equations: Equations, mu: Array, start: State | None = None) ->
     -------
     None where the path passes a bifurcation, so that a body may go more than one way, or does not lead to ``mu``.
     """
-    dofs = np.zeros(equations.n_dofs) if start is None else start.dofs
-    path = _LoadRamp(equations, mu, dofs) if start is None else _Line(equations, start.mu, np.asarray(mu, dtype=float))
+    ramp, dofs = None, np.zeros(equations.n_dofs) if start is None else start.dofs
+    if start is None:
+        path = ramp = _LoadRamp(equations, mu, dofs)
+    else:
+        path = _Line(equations, start.mu, np.asarray(mu, dtype=float))
     try:
         point = _end_of_stable_path(ArcLength(path), State(np.zeros(1), dofs))
         found = None if point is None else solve(path, np.ones(1), point.state)
     except SolverError:
         return None
+    finally:
+        if ramp is not None:
+            ramp.end()
     return None if found is None else State(np.array(mu, dtype=float), found.dofs, found.negative_pivots)
 
 

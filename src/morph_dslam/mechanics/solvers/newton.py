@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-8
 #: Factorisations after which an iteration is given up.
 MAX_ITERATIONS = 20
+#: By so much, rad, supports turn a body in one increment at most: half a turn forwards and backwards end alike, and
+#: Newton's method takes a body to either.
+LARGEST_TURN = np.pi / 2.0
 #: Size of an update that is certainly wrong.
 DIVERGED = 10.0
 #: A step damped further has stalled.
@@ -116,6 +119,25 @@ def in_contact(equations: Equations) -> float:
     With contact, the tangent may jump.
     """
     return float(getattr(equations, "in_contact", 0.0))
+
+
+def turn(equations: Equations, begin: Array, end: Array) -> float:
+    """Angle, rad, by which supports turn a body between parameters (d,) and others.
+
+    Equations with prescribed rotations have a method ``turn`` of both; 0 without.
+    """
+    method = getattr(equations, "turn", None)
+    return 0.0 if method is None else float(method(begin, end))
+
+
+def refuse_large_turn(equations: Equations, begin: Array, end: Array) -> None:
+    """Raise SolverError if supports turn a body by more than `LARGEST_TURN` between parameters (d,) and others."""
+    angle = turn(equations, begin, end)
+    if angle > (1.0 + 1e-9) * LARGEST_TURN:
+        raise SolverError(
+            f"supports turn by {np.degrees(angle):.0f} degrees in one increment to {where(equations, end)}; "
+            f"it may be {np.degrees(LARGEST_TURN):.0f} at most"
+        )
 
 
 def where(equations: Equations, mu: Array) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import Equations, State, size, solve
+from morph_dslam.mechanics.solvers.newton import LARGEST_TURN, Equations, State, size, solve
 
 Array = NDArray[np.float64]
 #: Length of the first step in units of the body's size; factors of the drag after a step that converged, or did not.
@@ -28,6 +28,10 @@ class Dragged(Equations, Protocol):
     @property
     def length(self) -> float: ...
 
+    def turn_from(self, x: Array, mu: Array) -> float:
+        """Angle, rad, by which supports that are at rest in ``x`` (n,) turn on the way to parameters (d,)."""
+        ...
+
     def set_drag(self, drag: float, x: Array) -> None:
         """Tie the body to ``x`` (n,) by ``drag``, a force per area and displacement; 0 lets it go."""
         ...
@@ -36,8 +40,12 @@ class Dragged(Equations, Protocol):
 def relaxed_state(equations: Dragged, mu: Array, area: float) -> State:
     """Where a body of this ``area``, m2, comes to rest from the undeformed state under the loads at ``mu`` (d,).
 
-    Raises SolverError if it does not in `MAX_STEPS` steps.
+    Raises SolverError if it does not in `MAX_STEPS` steps, or if supports turn by more than `newton.LARGEST_TURN`.
     """
+    if equations.turn_from(np.zeros(equations.n_dofs), mu) > LARGEST_TURN:
+        raise SolverError(
+            f"supports turn by more than {np.degrees(LARGEST_TURN):.0f} degrees before the body comes to rest"
+        )
     x = equations.prescribed(mu)
     forces = np.where(equations.free, equations.residual(np.zeros(equations.n_dofs), mu), 0.0)
     drag = max(float(np.linalg.norm(forces)), 1e-12) / (FIRST * equations.length * area)
