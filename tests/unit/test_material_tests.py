@@ -152,6 +152,27 @@ def test_deviations_are_those_of_repeated_tests(kind):
     assert np.mean(outside) < (0.12 if kind == "independent" else 0.3)
 
 
+@pytest.mark.slow
+def test_intervals_of_a_series_hold_the_relative_moduli_and_times():
+    """Stretched in an instant and held: the stress at once times 1 - sum m (1 - exp(-t / tau)), and noise."""
+    truth = {"relative_modulus_1": 0.3, "relative_modulus_2": 0.25, "time_1": 0.8, "time_2": 25.0}
+    time, stretch = np.r_[0.0, np.geomspace(0.05, 120.0, 59)], 1.5
+    left = 1.0 - 0.3 * (1.0 - np.exp(-time / 0.8)) - 0.25 * (1.0 - np.exp(-time / 25.0))
+    law = partial(Yeoh, c20=0.0, c30=0.0, bulk=1e9)
+    noise, missed = np.random.default_rng(0), []
+    for _ in range(20):
+        stress = 0.3e6 * (stretch - stretch**-2) * left + noise.normal(0.0, 2e3, len(time))
+        held = MaterialTest("held", np.full(len(time), stretch), stress, time)
+        bounds = [(0.0, 0.99)] * 2, [(0.1, 5.0), (5.0, 200.0)]
+        fit = fit_law(law, {"c10": (1e4, 1e7)}, [held], bounds, starts=1)
+        missed.append([(fit.constants[name] - value) / fit.deviations[name] for name, value in truth.items()])
+        prony = [*fit.material.prony.relative_moduli, *fit.material.prony.times]
+        assert [fit.constants[name] for name in truth] == pytest.approx(prony)
+    # 19 of 20 on average: each misses at most 3, and deviations are neither much too small nor much too large.
+    assert (np.abs(missed) > 1.96).sum(axis=0).max() <= 3
+    assert np.sqrt(np.mean(np.square(missed), axis=0)) == pytest.approx(1.0, abs=0.35)
+
+
 def test_a_constant_at_the_end_of_its_range_has_no_deviation():
     # A law that stiffens has c01 = 0 as its closest Mooney-Rivlin solid.
     stretch = np.linspace(1.0, 3.0, 20)

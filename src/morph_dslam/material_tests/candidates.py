@@ -119,7 +119,7 @@ class FittedLaw:
     def _keys(self) -> tuple[str, ...]:
         if isinstance(self.fit.material, Ogden):
             return ("moduli", "exponents")
-        return tuple(name for name in self.fit.constants if not name.startswith(("share_", "time_")))
+        return tuple(name for name in self.fit.constants if not name.startswith(("relative_modulus_", "time_")))
 
 
 def _yeoh_bounds(span: Span) -> list[dict[str, Bounds]]:

@@ -25,6 +25,8 @@ _FAR = 1e3
 _AT_END = 1e-7
 #: Neighbouring differences are taken as correlated by no more than this.
 _MOST_CORRELATED = 0.95
+#: What names of the series' constants begin with: of the two kinds that are searched for, and of what shares make.
+_SHARE, _TIME, _MODULUS = "share_", "time_", "relative_modulus_"
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Fit:
     Attributes
     ----------
     material : the law with the constants found.
-    constants : these by name, those of the Prony series included.
+    constants : these by name, those of the Prony series included: `relative_modulus_1`, `time_1` (s) and so on.
     deviations : standard deviations of the constants; infinite where the tests do not determine one, not a number where
         one is at an end of its bounds.
     errors : root mean square difference over root mean square stress of each test.
@@ -111,8 +113,8 @@ def fit_law(
     all_bounds, n_terms = dict(bounds), 0
     if prony_bounds is not None:
         n_terms = len(prony_bounds[0])
-        for kind, entries in zip(("share", "time"), prony_bounds, strict=True):
-            all_bounds |= {f"{kind}_{i + 1}": entry for i, entry in enumerate(entries)}
+        for kind, entries in zip((_SHARE, _TIME), prony_bounds, strict=True):
+            all_bounds |= {f"{kind}{i + 1}": entry for i, entry in enumerate(entries)}
     unknowns = _Unknowns(all_bounds)
     if (n_stressed := sum(int(np.count_nonzero(test.stress)) for test in tests)) < len(all_bounds):
         raise IdentificationError(f"{n_stressed} stresses do not determine {len(all_bounds)} constants; measure more")
@@ -133,11 +135,16 @@ def fit_law(
     inside = (best.x > _AT_END) & (best.x < 1.0 - _AT_END)
     deviations = np.full(len(best.x), np.nan)
     slopes = best.jac[:, inside] / unknowns.slopes(best.x)[inside]
-    deviations[inside] = _deviations(slopes, best.fun, [len(t.stress) for t in tests])
+    covariance = _covariance(slopes, best.fun, [len(t.stress) for t in tests])
+    moved = _series_slopes(values, n_terms)[:, inside]
+    deviations[inside] = _deviations(moved[inside], covariance)
+    moduli = _moduli(values, n_terms)
+    names = [_MODULUS + name.removeprefix(_SHARE) if name in moduli else name for name in all_bounds]
+    constants = dict(zip(names, (values | moduli).values(), strict=True))
     return Fit(
         material=assembled(law, values, n_terms),
-        constants=values,
-        deviations=dict(zip(all_bounds, deviations.tolist(), strict=True)),
+        constants=constants,
+        deviations=dict(zip(names, deviations.tolist(), strict=True)),
         errors=errors,
         error=float(np.sqrt(np.mean(np.square(errors)))),
         computed=computed,
@@ -157,8 +164,45 @@ def _best_of(differences: Callable[[Array], Array], size: int, starts: int, seed
     return best
 
 
-def _deviations(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Array:
-    """(k,) standard deviations of constants from what a fit left.
+def _moduli(values: Mapping[str, Any], n_terms: int) -> dict[str, Any]:
+    """The relative moduli of a series by the names of the shares that are searched for, in their order."""
+    moduli, left = {}, 1.0
+    for name in (f"{_SHARE}{i + 1}" for i in range(n_terms)):
+        moduli[name] = left * values[name]
+        left = left * (1.0 - values[name])
+    return moduli
+
+
+def _series_slopes(values: Mapping[str, float], n_terms: int) -> Array:
+    """(k, k) derivatives of a material's constants by those that are searched for, both in the order of ``values``.
+
+    They are the same but for the relative moduli: that of a term is its share of what the terms before it have left.
+    """
+    slopes, names = np.eye(len(values)), list(values)
+    shares = [f"{_SHARE}{i + 1}" for i in range(n_terms)]
+    for i, name in enumerate(shares):
+        # The modulus is linear in each of the shares up to its own.
+        for other in shares[: i + 1]:
+            ends = [_moduli({**values, other: end}, n_terms)[name] for end in (0.0, 1.0)]
+            slopes[names.index(name), names.index(other)] = ends[1] - ends[0]
+    return slopes
+
+
+def _deviations(slopes: Array, covariance: Array) -> Array:
+    """(k,) standard deviations of constants, to first order; infinite where the ``covariance`` (k, k) is.
+
+    Parameters
+    ----------
+    slopes : (k, k) derivatives of the constants by those of the covariance.
+    covariance : of those that were searched for.
+    """
+    if not np.all(np.isfinite(covariance)):
+        return np.full(len(slopes), np.inf)
+    return np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+
+
+def _covariance(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Array:
+    """(k, k) covariance of constants from what a fit left; infinite where the tests do not determine them.
 
     Each test has its own scatter, so the covariance is the sandwich of White (Econometrica 48, 1980) by tests.
 
@@ -170,10 +214,10 @@ def _deviations(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Ar
     """
     n, k = jacobian.shape
     if k == 0:
-        return np.zeros(0)
+        return np.zeros((0, 0))
     scale = np.linalg.norm(jacobian, axis=0)
     if not np.all(scale > 0.0) or np.linalg.matrix_rank(jacobian / scale) < k:
-        return np.full(k, np.inf)
+        return np.full((k, k), np.inf)
     scaled = jacobian / scale
     inverse = np.linalg.inv(scaled.T @ scaled)
     meat = np.zeros((k, k))
@@ -183,7 +227,7 @@ def _deviations(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Ar
         # Constants take degrees of freedom from all tests in proportion to their points.
         variance = left @ left / max((end - start) * (1.0 - k / n), 1.0)
         meat += variance / _effective_share(left) * part.T @ part
-    return np.sqrt(np.diag(inverse @ meat @ inverse)) / scale
+    return inverse @ meat @ inverse / np.outer(scale, scale)
 
 
 def _effective_share(left: Array) -> float:
@@ -201,13 +245,9 @@ def _effective_share(left: Array) -> float:
 
 def assembled(law: Callable[..., Material], values: Mapping[str, Any], n_terms: int) -> Material:
     """The material of named constants, the ``n_terms`` of the Prony series among them."""
-    own = {k: v for k, v in values.items() if not k.startswith(("share_", "time_"))}
+    own = {k: v for k, v in values.items() if not k.startswith((_SHARE, _TIME))}
     material = law(**own)
     if n_terms == 0:
         return material
-    moduli, left = [], 1.0
-    for i in range(n_terms):
-        moduli.append(left * values[f"share_{i + 1}"])
-        left = left * (1.0 - values[f"share_{i + 1}"])
-    times = tuple(values[f"time_{i + 1}"] for i in range(n_terms))
-    return replace(material, prony=Prony(tuple(moduli), times, (0.0,) * n_terms))
+    times = tuple(values[f"{_TIME}{i + 1}"] for i in range(n_terms))
+    return replace(material, prony=Prony(tuple(_moduli(values, n_terms).values()), times, (0.0,) * n_terms))

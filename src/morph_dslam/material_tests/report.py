@@ -183,7 +183,7 @@ def _unstable(each: Mapping[str, Any]) -> str:
 
 def _constant_line(constant: Mapping[str, Any]) -> str:
     name, value, deviation = constant["name"], constant["value"], constant["standard_deviation"]
-    stress = not name.startswith(("exponent", "limit", "share", "time"))
+    stress = not name.startswith(("exponent", "limit", "relative_modulus", "time"))
     scale, unit = (_MEGAPASCAL, " MPa") if stress else (1.0, " s" if name.startswith("time") else "")
     if constant["at_bound"]:
         return f"{name} = {value / scale:.4g}{unit}, at the end of its range"
@@ -191,7 +191,7 @@ def _constant_line(constant: Mapping[str, Any]) -> str:
         return f"{name} = {value / scale:.4g}{unit}, not determined by these tests"
     half = _HALF_INTERVAL * deviation
     low, weak = value - half, "; these tests hardly determine it" if half > abs(value) else ""
-    if name.startswith(("modulus", "limit", "share", "time")):
+    if name.startswith(("modulus", "limit", "relative_modulus", "time")):
         low = max(low, 0.0)
     low, high = low / scale, (value + half) / scale
     return f"{name} = {value / scale:.4g}{unit}, 95 % interval {low:.4g} to {high:.4g}{unit}{weak}"
