@@ -49,6 +49,43 @@ solver = { workers = 1, threads = 1 }
 )
 
 
+def coarse(certificate: dict[str, Any]) -> list[str]:
+    """The warnings about a coarse mesh."""
+    return [text for text in certificate.get("warnings", []) if "is too coarse" in text]
+
+
+def test_a_plate_that_hardly_bends_is_said_to_be_too_coarse() -> None:
+    """A clamped plate under pressure sinks by 0.00126 p a^4 / D (Timoshenko), D = E t^3 / 12 (1 - nu^2)."""
+    side, thickness, young, pressure = 0.1, 0.3e-3, 1e9, 1.0
+    study: dict[str, Any] = {
+        "name": "plate",
+        "mesh": {"generator": "block", "size": ["100 mm", "100 mm", "0.3 mm"], "divisions": [4, 4, 1], "cells": "hex8"},
+        "materials": {"plastic": {"law": "neo_hookean", "young": "1 GPa", "poisson": 0.3}},
+        "supports": [{"kind": "fixed", "on": ["x_min", "x_max", "y_min", "y_max"]}],
+        "loads": [{"kind": "pressure", "on": "z_max", "pressure": "p"}],
+        "parameters": {"p": {"range": ["0 Pa", "1 Pa"]}},
+        "sampling": {"scheme": "even", "training": 8, "held_out": 4, "refined": 1},
+        "solver": {"workers": 1, "threads": 1},
+    }
+    model = md.build(md.make_study(study))
+    sunk = np.abs(model.displacement.value(np.array([pressure]))).max()
+    assert sunk < 0.3 * 0.00126 * pressure * side**4 / (young * thickness**3 / 12.0 / (1.0 - 0.3**2))
+    (said,) = coarse(model.certificate)
+    share = re.search(r"16 hex8.*by (\d+) % of displacements", said)
+    assert share is not None, said
+    assert float(share[1]) > 70.0
+    assert "solver.order = 2" in said
+    assert "shell" in said
+
+
+def test_a_mesh_that_is_fine_enough_is_not() -> None:
+    """Two hexahedra through a bar that is pulled: its stretch is that of the law within a percent."""
+    study = BLOCK | {"sampling": BLOCK["sampling"] | {"refined": 1}}
+    certificate = md.build(md.make_study(study)).certificate
+    assert "errors" in certificate["discretisation"]
+    assert not coarse(certificate)
+
+
 def middle_of(nodes: np.ndarray) -> np.ndarray:
     return np.abs(nodes[:, 0] - 0.02) < 1e-9
 

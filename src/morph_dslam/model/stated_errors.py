@@ -12,7 +12,8 @@ import numpy as np
 
 from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION, ReducedModel
 
-#: Displacements, stress and forces that the reduction misses by more than this part are not to be relied on.
+#: Displacements, stress and forces that the reduction, or the mesh, misses by more than this part are not to be relied
+#: on. Of the mesh stress is left out: it is singular at edges of supports, in good models too.
 MOST = 0.1
 #: The certificate's entries, within that of the discretisation, of why it has no error, and whether it can have one.
 NOT_ESTIMATED, ESTIMABLE = "not_estimated", "estimable"
@@ -29,23 +30,40 @@ def doubtful_errors(model: ReducedModel) -> dict[str, float]:
     Of several faces or supports it is the largest, as a part of the largest value of all of them: what is missed of a
     support that hardly holds anything matters to nobody. Moments count by the force that has them on the body's size.
     """
-    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
     stated = model.certificate
+    stresses = {"von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stated_stresses(model)]}
+    return _above_most(_moved(stated) | stresses | _forces(model, stated))
+
+
+def doubtful_mesh_errors(model: ReducedModel) -> dict[str, float]:
+    """Errors by the mesh above `MOST`, as `doubtful_errors` has those of the reduction, but for stress."""
+    stated = model.certificate.get("discretisation", {}).get("errors", {})
+    return _above_most(_moved(stated) | _forces(model, stated))
+
+
+#: Certificate entries; with each the key of its largest value and the factor to one unit.
+_Entries = list[tuple[dict[str, Any], str, float]]
+
+
+def _moved(stated: dict[str, Any]) -> dict[str, _Entries]:
+    return {"displacements": [(stated.get("displacement", {}), "largest_mm", 1.0)]}
+
+
+def _forces(model: ReducedModel, stated: dict[str, Any]) -> dict[str, _Entries]:
+    size = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
     reactions = {name: stated.get(REACTION + name, {}) for name in model.reactions}
     forces = [(entry, "largest_N", 1.0) for name, entry in reactions.items() if name.startswith(FORCE)]
     moments = [(entry, "largest_Nmm", 1e-3 / size) for name, entry in reactions.items() if name.startswith(MOMENT)]
-    moved = [(stated.get("displacement", {}), "largest_mm", 1.0)]
-    kinds = {
-        "displacements": moved,
-        "von Mises stress": [(entry, "largest_MPa", 1.0) for entry in stated_stresses(model)],
-        "forces": [*forces, *moments],
-    }
+    return {"forces": [*forces, *moments]}
+
+
+def _above_most(kinds: dict[str, _Entries]) -> dict[str, float]:
     errors = {kind: _largest(entries) for kind, entries in kinds.items()}
     return {kind: error for kind, error in errors.items() if error > MOST}
 
 
-def _largest(entries: list[tuple[dict[str, Any], str, float]]) -> float:
-    """The largest error of certificate entries; with each the key of its largest value and the factor to one unit."""
+def _largest(entries: _Entries) -> float:
+    """The largest error, as a part of the largest value of all."""
     found = [(entry.get("relative_l2"), factor * entry.get(key, 0.0)) for entry, key, factor in entries]
     known = [(error, value) for error, value in found if error is not None]
     largest = max((value for _, value in known), default=0.0)

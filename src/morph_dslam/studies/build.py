@@ -16,10 +16,11 @@ from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.geometry import fit_similarity
 from morph_dslam.io.writing import writing
+from morph_dslam.mechanics.spaces import default_order
 from morph_dslam.meshing.mesh_notes import many_cells_note
 from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
 from morph_dslam.model import ReducedModel, save_model
-from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words
+from morph_dslam.model.stated_errors import doubtful_errors, doubtful_mesh_errors, errors_in_words
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.bisection import COARSER
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
@@ -79,6 +80,10 @@ UNSOLVED_REDUCTION = (
 DOUBTFUL = (
     "the model misses {} at held-out solutions: do not rely on what it says of these; take more samples, or narrow the "
     "ranges of the parameters"
+)
+COARSE = (
+    "the mesh ({}) is too coarse: with finer elements on its cells the solutions differ by {} (relative L2), and loads "
+    "and moduli found in images are off likewise. Take {}"
 )
 
 
@@ -154,7 +159,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     model.certificate["discretisation"] = discretisation_errors(chosen, snapshots, model, time.thread_time() - begin)
     if isinstance(chosen, SolidStudy) and (deviation := study_mesh_deviation(chosen, chosen.solid_mesh())):
         model.certificate["mesh_deviation"] = deviation
-    doubts = _unstrained(snapshots) or _doubtful(model)
+    doubts = _unstrained(snapshots) or [*_too_coarse(chosen, model), *_doubtful(model)]
     if isinstance(chosen, ExternalStudy):
         doubts += chosen.doubts([*(group[0] for group in snapshots.training), *snapshots.held_out])
     if found := [*mesh_notes, *_unresolved(chosen, snapshots), *study_warnings(chosen), *doubts]:
@@ -259,6 +264,25 @@ def _doubtful(model: ReducedModel) -> list[str]:
     """A sentence if stress or forces are reduced too badly for use."""
     errors = doubtful_errors(model)
     return [DOUBTFUL.format(errors_in_words(errors))] if errors else []
+
+
+def _too_coarse(study: Study, model: ReducedModel) -> list[str]:
+    """A sentence if finer elements would move the body, or hold it, otherwise by far, and what to do about it."""
+    errors = doubtful_mesh_errors(model)
+    if not errors or not isinstance(study, SolidStudy | ShellStudy):
+        return []
+    if isinstance(study, ShellStudy):
+        mesh, advice = study.shell_mesh(), ["more cells, or solver.order = 3"]
+    else:
+        mesh = study.solid_mesh()
+        order = study.solver.order or default_order(mesh)
+        advice = ["elements of second order (solver.order = 2, or cells hex20)"] if order == 1 else []
+        advice += [
+            "more cells, over the thickness of walls and along them",
+            "a study of a shell for a body that is thin",
+        ]
+        advice += ["shorter increments of time"] if study.time else []
+    return [COARSE.format(described_mesh(mesh), errors_in_words(errors), "; or ".join(advice))]
 
 
 def _read(study: str | Path | Study) -> tuple[Study, str]:
