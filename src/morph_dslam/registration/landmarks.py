@@ -36,7 +36,8 @@ from morph_dslam.registration.messages import (
     UnusualSize,
     WrongUnit,
 )
-from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states
+from morph_dslam.registration.other_values import as_set, plausible_minima, values_of_same_shape
+from morph_dslam.registration.outline_snap import OutlineSnap, distinct_states
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
@@ -143,7 +144,9 @@ def register_landmarks(
     found = _estimates(estimator, bound, pixels, starts)
     if at_rest:
         found = [_of_pose_alone(estimator, bound, pixels, estimate) for estimate in found]
-    best, alternatives = _distinct_minima(model, found, click_px)
+    plausible = plausible_minima(found, click_px)
+    best = plausible[0]
+    alternatives = distinct_states(model, best.state, [estimate.state for estimate in plausible[1:]])
     rms, diagonal = _rms(best), float(np.hypot(camera.width, camera.height))
     _check_residual(estimator, bound, pixels, best, names)
     facts = {
@@ -160,7 +163,7 @@ def register_landmarks(
         least_share = 0.0 if best.sigma_px > poor_px else MOVED_SHARE
         moved = not_at_rest(estimator, bound, pixels, best, further, click_px, least_share)
     # A few landmarks that happen to fit well, or that a wrong model fits, are not exact for that.
-    covariance = best.covariance * max(1.0, (click_px / max(best.sigma_px, 1e-12)) ** 2)
+    covariance = best.covariance * as_set(best, click_px)
     variance, normals = max(click_px, best.sigma_px) ** 2, np.zeros_like(pixels)
     measured = MeasuredPoints(estimator, bound, pixels, np.ones(len(bound)), normals, variance)
     notes: tuple[RegistrationWarning, ...] = ()
@@ -185,6 +188,8 @@ def register_landmarks(
         linear, covariance = covariance, measured.spread_of_plausible(best.state, covariance)
         aids = "depth images" if image is not None else "depth images, the outline (--snap)"
         notes = (*notes, *measured.notes(best.state, linear, covariance, aids))
+    is_corrected = depth is not None or facts.get("corrected_by_outline", False)
+    notes = (*notes, *values_of_same_shape(model, plausible, covariance, click_px, is_corrected))
     alone_px = facts["sigma_px"] if depth is not None else np.nan
     warnings = _warnings(model, best, len(alternatives), bound.rest, click_px, poor_px, moved, alone_px)
     if contradiction := cameras_contradict(estimator, bound, pixels, best, click_px):
@@ -364,16 +369,6 @@ def _without_parameters(covariance: Array) -> Array:
     known, d = np.zeros_like(covariance), len(covariance) - 6
     known[d:, d:] = covariance[d:, d:]
     return known
-
-
-def _distinct_minima(model: ReducedModel, found: list[Estimate], click_px: float) -> tuple[Estimate, tuple[State, ...]]:
-    """The best minimum, and different ones that landmarks of the stated accuracy cannot exclude."""
-    best = found[0]
-    freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
-    variance = max(click_px**2, 2.0 * best.cost / freedom)
-    # Twice the log-likelihood ratio of two minima.
-    plausible = [e.state for e in found if 2.0 * (e.cost - best.cost) < EXCLUDED * variance]
-    return best, distinct_states(model, best.state, plausible)
 
 
 def _rms(estimate: Estimate) -> float:

@@ -206,6 +206,23 @@ class ShapeAgainstPose(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class OtherValues(RegistrationWarning):
+    """Values of parameters far from each other fit the landmarks, in nearly the same shape.
+
+    Attributes
+    ----------
+    parameters : with the value that was taken, and then the others.
+    """
+
+    template: ClassVar[str] = (
+        "registration ambiguous: other values of parameters fit the landmarks as well, in nearly the same shape: "
+        "{parameters}. The first value is taken, and stress and forces follow from it; narrow the range if you know "
+        "which is right"
+    )
+    parameters: str
+
+
+@dataclass(frozen=True)
 class LandmarksTurnedAway(RegistrationWarning):
     """The camera would see the landmarks through the object.
 

@@ -46,6 +46,12 @@ def mesh_in_camera(model: ReducedModel, state: State) -> Array:
     return state.camera_from_object.apply(model.positions(state.parameters))
 
 
+def shape_distance(model: ReducedModel, one: State, other: State) -> float:
+    """Mean distance of the nodes in two states, as a share of the object's size."""
+    away = np.linalg.norm(mesh_in_camera(model, one) - mesh_in_camera(model, other), axis=1).mean()
+    return float(away / np.linalg.norm(np.ptp(model.nodes, axis=0)))
+
+
 def distinct_states(model: ReducedModel, best: State, others: Iterable[State]) -> tuple[State, ...]:
     """Those states that differ from the best and from each other: by their nodes' mean distance."""
     least = DISTINCT_SHARE * float(np.linalg.norm(np.ptp(model.nodes, axis=0)))

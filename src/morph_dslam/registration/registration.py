@@ -18,7 +18,14 @@ from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.notices import Notice
-from morph_dslam.registration.messages import Ambiguous, AngleOpen, OutlineElsewhere, TurnArbitrary, read_warning
+from morph_dslam.registration.messages import (
+    Ambiguous,
+    AngleOpen,
+    OtherValues,
+    OutlineElsewhere,
+    TurnArbitrary,
+    read_warning,
+)
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.tracking.state import Prior, State, pose_increment
 
@@ -237,7 +244,7 @@ class Registration:
     @property
     def ambiguous(self) -> bool:
         """Whether another registration is nearly as good, or the images do not confirm this one."""
-        return any(isinstance(warning, Ambiguous | OutlineElsewhere) for warning in self.warnings)
+        return any(isinstance(warning, Ambiguous | OtherValues | OutlineElsewhere) for warning in self.warnings)
 
     def pose_deviations(self) -> tuple[float, float] | None:
         """Standard deviations of the mean node's place, metres, and of the attitude, rad, in the reference frame.
