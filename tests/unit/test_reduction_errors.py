@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.model import SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.model.reduction_errors import ReductionErrors, errors_on_modes
 from tests.support.stretched_block import SIZE, stretched_block_model
@@ -92,12 +94,56 @@ def test_a_parameter_that_is_known_makes_no_error_good(model, constant):
     assert found == pytest.approx(np.diag([0.0, alone]), rel=1e-5, abs=1e-16)
 
 
-def test_a_parameter_that_moves_the_surface_by_less_than_the_error_is_anywhere_in_its_range(model):
-    """Errors of a thousand ranges: a uniform distribution over the range has a deviation of range / sqrt(12)."""
+def anywhere(share):
+    """Second moment about a place in a range, a share of it from its beginning, of values spread evenly over it."""
+    return (share**3 + (1.0 - share) ** 3) / 3.0
+
+
+@pytest.mark.parametrize("state", [[0.0, 0.001], [-0.2, 0.004]])
+def test_a_parameter_that_moves_the_surface_by_less_than_the_error_is_anywhere_in_its_range(model, state):
+    """Errors of a thousand ranges."""
     errors = [displacement(model, [0.0, 10.0]), displacement(model, [0.0, -10.0])]
-    found = errors_of(certified(model, errors, mean_mm=1e6)).covariance(np.array([0.0, 0.001]), NEITHER)
+    found = errors_of(certified(model, errors, mean_mm=1e6)).covariance(np.array(state), NEITHER)
     ranges = model.upper - model.lower
-    assert np.sqrt(np.diag(found)) == pytest.approx(ranges / np.sqrt(12.0), rel=1e-2)
+    expected = ranges * np.sqrt(anywhere((state - model.lower) / ranges))
+    assert np.sqrt(np.diag(found)) == pytest.approx(expected, rel=0.1)
+
+
+EPSILON = 1e-6
+
+
+def with_a_valley(model):
+    """Shapes by the sum of both parameters, scaled to -1 to 1, but for an error of EPSILON times a polynomial."""
+    coefficients = np.array([[1e-3, 0.0], [1e-3, 0.0], [0.0, EPSILON]])
+    functions = ParameterFunctions(model.lower, model.upper, np.array([[1, 0], [0, 1], [8, 0]]), coefficients)
+    return replace(model, displacement=SeparatedField(model.displacement.modes, functions))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.98, 0.7, 0.5])
+def test_a_sum_of_parameters_that_the_error_alone_splits_is_all_that_is_known(model, share):
+    """The polynomial of degree 8 changes by 64 EPSILON at the end of the range, and by 2 EPSILON all along."""
+    valley, z = with_a_valley(model), model.nodes[:, [2, 0, 0]] * [1.0 / SIZE[2], 0.0, 0.0]
+    errors = errors_of(certified(valley, [EPSILON * z, -EPSILON * z], mean_mm=2e3 * EPSILON))
+    ranges = model.upper - model.lower
+    found = errors.covariance(model.lower + [share, 1.0 - share] * ranges, NEITHER) / np.outer(ranges, ranges)
+    assert found == pytest.approx(anywhere(share) * np.array([[1.0, -1.0], [-1.0, 1.0]]), rel=0.25)
+    # Many states show no more: one of both is one value of all of them.
+    constant = errors.covariance(model.lower + [share, 1.0 - share] * ranges, np.array([False, True]))
+    assert 0.2 < np.sqrt(constant[1, 1]) / ranges[1] < np.sqrt(anywhere(1.0))
+    # An error that is a thousand times smaller leaves the polynomial to tell both.
+    sure = errors_of(certified(valley, [1e-3 * EPSILON * z] * 2, mean_mm=2.0 * EPSILON))
+    if share > 0.9:
+        found = sure.covariance(model.lower + [share, 1.0 - share] * ranges, NEITHER)
+        assert np.sqrt(np.diag(found)) == pytest.approx(0.0, abs=1e-3 * ranges.max())
+
+
+def test_a_valley_ends_where_a_range_does(model):
+    """The sum of the parameters is the most but a tenth of a range: only that is left of either one."""
+    valley, z = with_a_valley(model), model.nodes[:, [2, 0, 0]] * [1.0 / SIZE[2], 0.0, 0.0]
+    errors = errors_of(certified(valley, [EPSILON * z, -EPSILON * z], mean_mm=2e3 * EPSILON))
+    ranges = model.upper - model.lower
+    found = errors.covariance(model.upper - [0.0, 0.1] * ranges, NEITHER) / np.outer(ranges, ranges)
+    assert np.sqrt(np.diag(found)) == pytest.approx(0.1 / np.sqrt(3.0), rel=0.15)
 
 
 def test_the_displacement_is_off_by_the_certified_error(model):

@@ -41,7 +41,7 @@ def shape_errors(model: ReducedModel, positions: Callable[[Vector], Array], vect
             mu = np.clip(vector(known), model.lower + STEP * ranges, model.upper - STEP * ranges)
             key = mu.tobytes()
             if key not in changes:
-                changes[key] = _root(errors.at(mu).parameters / np.outer(ranges, ranges))
+                changes[key] = _root(errors.at(mu, followed=False).parameters / np.outer(ranges, ranges))
             return mu + share * ranges * changes[key][:, k]
 
         return made

@@ -84,8 +84,8 @@ class ModelErrors:
         has_time = len(self.clocks) == 1 and self.clocks[0] in known
         return replace(self, mesh=self.others[has_time, free_pose], has_time=has_time)
 
-    def at(self, mu: Array) -> ModelDeviation:
-        """In the state ``mu`` (d,), SI."""
+    def at(self, mu: Array, followed: bool = True) -> ModelDeviation:
+        """In the state ``mu`` (d,), SI; ``followed`` as in `ReductionErrors.covariance`."""
         covariance, squared, in_object = np.zeros((len(mu), len(mu))), 0.0, 0.0
         if self.mesh is not None:
             of_parameters, left, with_pose = self.mesh.at(mu)
@@ -93,7 +93,7 @@ class ModelErrors:
         if self.reduction is not None:
             own, known = len(mu) - self.n_loads, np.zeros(len(mu), dtype=bool)
             known[list(self.clocks)] = self.has_time
-            covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own], known[:own])
+            covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own], known[:own], followed)
             by_reduction = self.reduction.size_at(mu[:own]) ** 2
             squared, in_object = squared + by_reduction, in_object + by_reduction
         return ModelDeviation(covariance, float(np.sqrt(squared)), float(np.sqrt(in_object)))

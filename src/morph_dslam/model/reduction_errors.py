@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.functions import Functions
+from morph_dslam.model.hidden_changes import Hidden, HiddenChanges
 from morph_dslam.model.parameter_errors import mean_products, surface_modes
 from morph_dslam.model.reduced_model import ReducedModel
 
@@ -52,7 +53,7 @@ class ReductionErrors:
     states : (k, d) held-out, SI.
     on_modes : (k, m) as of `errors_on_modes`.
     sizes : (k,) of the displacement's errors, metres.
-    ranges : (d,) of the parameters.
+    lower, ranges : (d,) of the parameters, where they begin and how wide they are.
     functions : of the displacement.
     products : (m, m) mean products of its modes on the surface, without rigid motions, squared metres.
     """
@@ -60,6 +61,7 @@ class ReductionErrors:
     states: Array
     on_modes: Array
     sizes: Array
+    lower: Array
     ranges: Array
     functions: Functions
     products: Array
@@ -75,14 +77,18 @@ class ReductionErrors:
             return None
         products = mean_products(_deforming_modes(model))
         sizes = 1e-3 * np.array(stated["mean_mm"], dtype=np.float64)
-        return cls(states, on_modes, sizes, model.upper - model.lower, model.displacement.functions, products)
+        ranges, functions = model.upper - model.lower, model.displacement.functions
+        return cls(states, on_modes, sizes, model.lower, ranges, functions, products)
 
-    def covariance(self, mu: Array, constant: NDArray[np.bool_], known: NDArray[np.bool_] | None = None) -> Array:
+    def covariance(
+        self, mu: Array, constant: NDArray[np.bool_], known: NDArray[np.bool_] | None = None, followed: bool = True
+    ) -> Array:
         """Covariance (d, d) of the parameters at a state, SI.
 
         With D the effects, e the error and r its size, the parameters are off by (D'D + r^2)^-1 D'e. What that leaves
         out is how far they are from where they are taken without evidence, r^2 (D'D + r^2)^-1 of it: one that moves the
-        surface by less than the error is anywhere in its range. Errors of nearby held-out states count more.
+        surface by less than the error is anywhere that the error hides, see `hidden_changes`. Errors of nearby held-out
+        states count more.
 
         Parameters
         ----------
@@ -90,15 +96,19 @@ class ReductionErrors:
         constant : (d,) which parameters are found from many states together. Their errors are those at the held-out
             states, of which each counts by how well it shows the parameter.
         known : (d,) which parameters are known exactly: they make no error good. None without any.
+        followed : whether hidden changes are followed beyond where the derivatives hold. Without, the changes still
+            move the surface by these derivatives as the errors do.
         """
         effects, known = self._effects(mu), np.zeros(len(mu), dtype=bool) if known is None else known
         constant, free = constant & ~known, np.flatnonzero(~constant & ~known)
         least = self._least(mu)
         inverse = self._inverse(effects[free], least)
-        found = np.zeros((len(mu), len(mu)))
-        errors = inverse @ effects[free] @ self.on_modes.T
         unknown = least * inverse
-        found[np.ix_(free, free)] = errors * self._weights(mu) @ errors.T + UNKNOWN * unknown @ unknown.T
+        hidden = Hidden(effects[free], UNKNOWN * unknown @ unknown.T)
+        hidden = self._hidden(mu, free, least) if followed else hidden
+        found = np.zeros((len(mu), len(mu)))
+        errors = inverse @ hidden.effects @ self.on_modes.T
+        found[np.ix_(free, free)] = errors * self._weights(mu) @ errors.T + hidden.spread
         # What a constant is off by, the others make good as far as they can.
         taken = np.eye(len(mu))[:, constant]
         taken[free] = -inverse @ effects[free] @ self.products @ effects[constant].T
@@ -121,6 +131,20 @@ class ReductionErrors:
         """Derivatives (d, m) of the displacement's functions by the parameters, over their whole ranges."""
         return self.functions.rows(self.functions.nearest_inside(mu))[1:] * self.ranges[:, None]
 
+    def _hidden(self, mu: Array, sought: NDArray[np.int64], least: float) -> Hidden:
+        """What the error, ``least`` as of `_least`, hides of parameters ``sought`` (f,), by number, at a state (d,)."""
+        inside = self.functions.nearest_inside(mu)
+        ranges, lower, taken = self.ranges[sought], self.lower[sought], np.append(0, 1 + sought)
+        factors = np.append(1.0, ranges)[:, None]
+
+        def rows(place: Array) -> Array:
+            there = inside.copy()
+            there[sought] = lower + ranges * place
+            return np.asarray(self.functions.rows(there)[taken] * factors)
+
+        place = np.clip((inside - self.lower)[sought] / ranges, 0.0, 1.0)
+        return HiddenChanges(rows, self.products, place, least).found()
+
     def _inverse(self, effects: Array, least: float) -> Array:
         """Of the parameters' normal matrix (d, d); one that moves the surface by less than the error is unknown."""
         normal = effects @ self.products @ effects.T
@@ -137,10 +161,12 @@ class ReductionErrors:
             sought = np.flatnonzero(~known)
             totals, weights = np.zeros(len(sought)), np.zeros(len(sought))
             for mu, on_modes in zip(self.states, self.on_modes, strict=True):
-                effects = self._effects(mu)[sought]
-                inverse = self._inverse(effects, self._least(mu))
-                shown = 1.0 / np.diag(inverse)
-                totals, weights = totals + shown * (inverse @ effects @ on_modes) ** 2, weights + shown
+                least = self._least(mu)
+                hidden = self._hidden(mu, sought, least)
+                inverse = self._inverse(self._effects(mu)[sought], least)
+                shown = 1.0 / np.diag(self._inverse(hidden.effects, least))
+                squares = (inverse @ hidden.effects @ on_modes) ** 2 + np.diag(hidden.spread)
+                totals, weights = totals + shown * squares, weights + shown
             found[sought] = totals / weights
             self._variances[key] = found
         return self._variances[key]
