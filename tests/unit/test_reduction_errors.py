@@ -127,14 +127,22 @@ def test_a_sum_of_parameters_that_the_error_alone_splits_is_all_that_is_known(mo
     ranges = model.upper - model.lower
     found = errors.covariance(model.lower + [share, 1.0 - share] * ranges, NEITHER) / np.outer(ranges, ranges)
     assert found == pytest.approx(anywhere(share) * np.array([[1.0, -1.0], [-1.0, 1.0]]), rel=0.25)
-    # Many states show no more: one of both is one value of all of them.
-    constant = errors.covariance(model.lower + [share, 1.0 - share] * ranges, np.array([False, True]))
-    assert 0.2 < np.sqrt(constant[1, 1]) / ranges[1] < np.sqrt(anywhere(1.0))
     # An error that is a thousand times smaller leaves the polynomial to tell both.
     sure = errors_of(certified(valley, [1e-3 * EPSILON * z] * 2, mean_mm=2.0 * EPSILON))
     if share > 0.9:
         found = sure.covariance(model.lower + [share, 1.0 - share] * ranges, NEITHER)
         assert np.sqrt(np.diag(found)) == pytest.approx(0.0, abs=1e-3 * ranges.max())
+
+
+def test_many_states_show_no_more_of_a_value_of_the_sequence(model):
+    """They hide the same share of its range wherever it is found: at its end the mean square is four times as large."""
+    valley, z = with_a_valley(model), model.nodes[:, [2, 0, 0]] * [1.0 / SIZE[2], 0.0, 0.0]
+    errors = errors_of(certified(valley, [EPSILON * z, -EPSILON * z], mean_mm=2e3 * EPSILON))
+    middle, end = (errors.covariance(np.array([0.0, slide]), np.array([False, True])) for slide in (0.0, 0.01))
+    assert end == pytest.approx(4.0 * middle, rel=0.05)
+    ranges = model.upper - model.lower
+    assert 0.3 < np.sqrt(end[1, 1]) / ranges[1] < np.sqrt(anywhere(1.0))
+    assert end[0, 0] / ranges[0] ** 2 == pytest.approx(end[1, 1] / ranges[1] ** 2, rel=0.05)
 
 
 def test_a_valley_ends_where_a_range_does(model):

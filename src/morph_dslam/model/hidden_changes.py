@@ -29,6 +29,11 @@ HALVINGS = 2
 PART = 1e-3
 
 
+def anywhere(place: Array) -> Array:
+    """Second moments (f,) about places in ranges from 0 to 1 of values that are anywhere in these."""
+    return np.asarray((place**3 + (1.0 - place) ** 3) / 3.0)
+
+
 @dataclass(frozen=True)
 class Hidden:
     """What a model hides about one state.
@@ -74,8 +79,7 @@ class HiddenChanges:
                 shares[k], part = _judged(*back, *forth, slope, self._least)
                 spread += part
         # No parameter is farther off than its range allows, however many directions it takes part in.
-        most = (self._place**3 + (1.0 - self._place) ** 3) / 3.0
-        cut = np.sqrt(np.minimum(1.0, most / np.maximum(np.diag(spread), np.finfo(float).tiny)))
+        cut = np.sqrt(np.minimum(1.0, anywhere(self._place) / np.maximum(np.diag(spread), np.finfo(float).tiny)))
         return Hidden((vectors * shares) @ vectors.T @ self._effects, spread * np.outer(cut, cut))
 
     def _way(self, along: Array, others: Array, slope: float) -> tuple[Array, float]:

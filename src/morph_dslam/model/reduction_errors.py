@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.functions import Functions
-from morph_dslam.model.hidden_changes import Hidden, HiddenChanges
+from morph_dslam.model.hidden_changes import Hidden, HiddenChanges, anywhere
 from morph_dslam.model.parameter_errors import mean_products, surface_modes
 from morph_dslam.model.reduced_model import ReducedModel
 
@@ -112,7 +112,7 @@ class ReductionErrors:
         # What a constant is off by, the others make good as far as they can.
         taken = np.eye(len(mu))[:, constant]
         taken[free] = -inverse @ effects[free] @ self.products @ effects[constant].T
-        found += taken * self._of_constants(known)[constant] @ taken.T
+        found += taken * self._of_constants(mu, known)[constant] @ taken.T
         return np.asarray(found * np.outer(self.ranges, self.ranges))
 
     def size_at(self, mu: Array) -> float:
@@ -142,8 +142,7 @@ class ReductionErrors:
             there[sought] = lower + ranges * place
             return np.asarray(self.functions.rows(there)[taken] * factors)
 
-        place = np.clip((inside - self.lower)[sought] / ranges, 0.0, 1.0)
-        return HiddenChanges(rows, self.products, place, least).found()
+        return HiddenChanges(rows, self.products, self._places(inside)[sought], least).found()
 
     def _inverse(self, effects: Array, least: float) -> Array:
         """Of the parameters' normal matrix (d, d); one that moves the surface by less than the error is unknown."""
@@ -154,24 +153,42 @@ class ReductionErrors:
         """Squared movement of the surface, square metres, below which the error hides a parameter."""
         return max(self.size_at(mu) ** 2, float(np.finfo(float).tiny))
 
-    def _of_constants(self, known: NDArray[np.bool_]) -> Array:
-        """Variances (d,) of parameters found from many states, over their ranges squared; 0 of those known (d,)."""
-        key, found = known.tobytes(), np.zeros(len(self.ranges))
+    def _of_constants(self, mu: Array, known: NDArray[np.bool_]) -> Array:
+        """Variances (d,) of parameters found from many states, over their ranges squared; 0 of those known (d,).
+
+        What the states hide of a range, they hide wherever in it the parameter is found, at a state (d,).
+        """
+        key = known.tobytes()
         if key not in self._variances:
-            sought = np.flatnonzero(~known)
-            totals, weights = np.zeros(len(sought)), np.zeros(len(sought))
-            for mu, on_modes in zip(self.states, self.on_modes, strict=True):
-                least = self._least(mu)
-                hidden = self._hidden(mu, sought, least)
-                inverse = self._inverse(self._effects(mu)[sought], least)
-                shown = 1.0 / np.diag(self._inverse(hidden.effects, least))
-                squares = (inverse @ hidden.effects @ on_modes) ** 2 + np.diag(hidden.spread)
-                totals, weights = totals + shown * squares, weights + shown
-            found[sought] = totals / weights
-            self._variances[key] = found
-        return self._variances[key]
+            self._variances[key] = self._of_states(np.flatnonzero(~known))
+        of_errors, hidden = self._variances[key]
+        return of_errors + hidden * anywhere(self._places(mu))
+
+    def _of_states(self, sought: NDArray[np.int64]) -> tuple[Array, Array]:
+        """What the held-out states tell together of parameters ``sought`` (f,), by number, over the ranges squared.
+
+        Returns
+        -------
+        Variances (d,) by their errors, and shares (d,) that are hidden of the variance of a value that is anywhere.
+        """
+        sums = np.zeros((4, len(sought)))
+        for mu, on_modes in zip(self.states, self.on_modes, strict=True):
+            least = self._least(mu)
+            hidden = self._hidden(mu, sought, least)
+            shown = 1.0 / np.diag(self._inverse(hidden.effects, least))
+            squares = (self._inverse(self._effects(mu)[sought], least) @ hidden.effects @ on_modes) ** 2
+            most = anywhere(self._places(mu)[sought])
+            sums += shown * np.array([np.ones(len(sought)), squares, np.diag(hidden.spread), most])
+        weights, errors, spread, most = sums
+        found = np.zeros((2, len(self.ranges)))
+        found[:, sought] = errors / weights, spread / most
+        return found[0], found[1]
+
+    def _places(self, mu: Array) -> Array:
+        """Where in its range each parameter is at a state (d,), from 0 to 1."""
+        return np.asarray(np.clip((mu - self.lower) / self.ranges, 0.0, 1.0))
 
     @cached_property
-    def _variances(self) -> dict[bytes, Array]:
-        """Those of `_of_constants` by what is known: they are asked for in every frame."""
+    def _variances(self) -> dict[bytes, tuple[Array, Array]]:
+        """What `_of_states` says, by what is known: it is asked for in every frame."""
         return {}
