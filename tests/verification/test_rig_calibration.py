@@ -101,7 +101,7 @@ def test_pictures_that_are_all_a_frame_late_give_no_camera_file(filmed, tmp_path
     late.mkdir()
     for frame in range(11):
         (late / f"{frame:02}.png").symlink_to(filmed / "1" / f"{frame + 1:02}.png")
-    with pytest.raises(CameraError, match="do not go together: the residual of .* pixels is large"):
+    with pytest.raises(CameraError, match=r"do not go together: the residual of .* pixels is large"):
         calibrate_rig([[filmed / "0"], [late]], MARKERS, tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
 
