@@ -122,6 +122,14 @@ class EdgeRegistration:
         return _rank(self.edges, self.points)
 
 
+def _as_well_seen(other: EdgeRegistration, found: EdgeRegistration) -> bool:
+    """Whether keyframes show as much of the outline at another place, as far as they agree on it.
+
+    Edges place an object more exactly than points do, so that these choose among places where as many edges are seen.
+    """
+    return other.edges.gain >= found.edges.gain - found.edges.gain_std
+
+
 def _rank(edges: EdgeEvidence, points: PointEvidence) -> float:
     """What speaks for a place, at most 1: its edges beyond chance and the points that agree must both do so."""
     return edges.total * max(points.agreement, NO_POINTS)
@@ -268,7 +276,8 @@ class EdgeSearch:
             return self._fitted(start, images, NEAREST)
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
-        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.rank)
+        fits = [each for each in on_all_cores(from_view, seeing) if _as_well_seen(each, found)]
+        return max([found, *fits], key=lambda each: each.rank)
 
     def _sized(self, found: EdgeRegistration) -> EdgeRegistration:
         """A place with the size by its edges and the points in its outline together, unless they contradict each other.
@@ -283,7 +292,7 @@ class EdgeSearch:
         sized = replace(self.at(place), covariance=covariance)
         apart = abs(np.log(place.scale / found.place.scale))
         agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > ABOUT_AS_MUCH * found.rank
-        return sized if agree else found
+        return sized if agree and _as_well_seen(sized, found) else found
 
     def _images(self, place: SimilarityTransform) -> EdgeImages:
         """Edges of the keyframes that see the object at a place."""
