@@ -11,7 +11,7 @@ import pytest
 import morph_dslam as md
 from morph_dslam.camera import Camera
 from morph_dslam.cli.app import main
-from morph_dslam.errors import ArgumentError, RegistrationError
+from morph_dslam.errors import ArgumentError, RegistrationError, SourceError
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_rig
@@ -513,7 +513,7 @@ def test_frames_that_one_camera_lacks_have_stand_ins(cameras, missing):
 class Timed(list[Frame]):
     """Frames with times of their own, 25 a second."""
 
-    has_assumed_times, fps = False, 25.0
+    has_assumed_times, fps, name = False, 25.0, "recorded"
 
 
 def timed(instants, ahead=0.0, seed=0):
@@ -552,6 +552,12 @@ def test_a_camera_whose_first_frame_was_lost_is_paired_by_the_common_clock():
     said = [tuple(None if isinstance(frame, MissingFrame) else frame.timestamp for frame in pair) for pair in both]
     assert said[0][1] is None
     assert all(abs(first - second) < 0.01 for first, second in said[1:])
+    for number in (1, 3):
+        assert [frame.timestamp for frame in both.at(number)] == list(said[number])
+    with pytest.raises(SourceError, match="camera 1 has no frame of the instant of frame 0"):
+        both.at(None)
+    with pytest.raises(SourceError, match="holds no frame 4"):
+        both.at(4)
 
 
 @pytest.mark.slow

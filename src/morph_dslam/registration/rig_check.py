@@ -64,6 +64,8 @@ def cameras_contradict(
     if is_far:
         state, poses = _each_alone(estimator, bound, pixels, state)
     free = _FreePoses(estimator, bound, pixels, state, poses, shape, freed)
+    if not np.isfinite(free.residuals(np.zeros(len(free.units)))).all():
+        return None  # a landmark is behind a camera
     found = least_squares(free.residuals, np.zeros(len(free.units)), bounds=free.room, x_scale="jac")
     if is_chance(2.0 * found.cost):
         return None

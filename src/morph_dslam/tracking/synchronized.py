@@ -41,6 +41,28 @@ class SynchronizedFrames:
         self.sources = tuple(sources)
         self.n_instants, self.n_missing, self.n_left_out = 0, [0] * len(sources), 0
 
+    @property
+    def goes_by_time(self) -> bool:
+        """Whether frames go together by their times."""
+        return all(getattr(source, "has_assumed_times", True) is False for source in self.sources)
+
+    def at(self, number: int | None) -> tuple[Frame, ...]:
+        """The frames of the instant of this number, the first one by default.
+
+        Raises SourceError if there is none, or a camera lacks it.
+        """
+        name = self.sources[0].name
+        for frames in self:
+            if number is None or frames[0].index == number:
+                lacking = [str(k) for k, frame in enumerate(frames) if isinstance(frame, MissingFrame)]
+                if lacking:
+                    raise SourceError(
+                        f"camera {lacking[0]} has no frame of the instant of frame {frames[0].index} of {name}: take a "
+                        "reference frame that all cameras have, or give --range from where they have"
+                    )
+                return frames
+        raise SourceError(f"{name} holds no frame {number} to take as the reference")
+
     def notices(self) -> list[RunNotice]:
         """What a reader must know if not all recordings have the same frames."""
         lacking = {number: count for number, count in enumerate(self.n_missing) if count}
@@ -77,7 +99,7 @@ class SynchronizedFrames:
         come = [frame for reader in readers for frame in islice(reader, 1)]
         if len(come) < len(readers):
             return
-        by_time = all(getattr(source, "has_assumed_times", True) is False for source in self.sources)
+        by_time = self.goes_by_time
         if not by_time:
             _check_begin(come)
         clocks = _Clocks(come, 0.5 / max(source.fps for source in self.sources) if by_time else None)

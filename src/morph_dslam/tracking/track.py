@@ -161,7 +161,11 @@ def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
 
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
-        return tuple(frame_at(path, run.first if number is None else number, scale) for path, scale in recordings)
+        wanted = run.first if number is None else number
+        every = SynchronizedFrames([open_source(path, None, None, run.fps, scale) for path, scale in recordings])
+        if run.other_cameras and every.goes_by_time:
+            return every.at(wanted)
+        return tuple(frame_at(path, wanted, scale) for path, scale in recordings)
 
     sources = [open_source(path, run.first, run.last, run.fps, scale) for path, scale in recordings]
     return (SynchronizedFrames(sources) if run.other_cameras else sources[0]), frames_at
