@@ -52,7 +52,6 @@ def test_help_and_version_need_no_heavy_import():
         assert "morph" in done.stdout
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "status"),
     [
