@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +105,7 @@ class _FreePoses:
     shape: NDArray[np.int64]
     freed: list[int]
 
-    @property
+    @cached_property
     def units(self) -> Array:
         """Of the unknowns: the parameters that are not known, the object's pose, and each free one."""
         scale = self.estimator.scale
@@ -134,8 +135,8 @@ class _FreePoses:
     def seen(self, state: State, poses: list[RigidTransform]) -> list[Array]:
         """Where each camera, in these poses, sees its landmarks."""
         return [
-            part.camera.project(self.bound.take(rows).in_camera(replace(part, camera_from_rig=pose).seen(state)))
-            for part, pose, rows in zip(self.estimator.cameras, poses, self._rows, strict=True)
+            part.camera.project(points.in_camera(replace(part, camera_from_rig=pose).seen(state)))
+            for part, pose, points in zip(self.estimator.cameras, poses, self._points, strict=True)
         ]
 
     def residuals(self, steps: Array) -> Array:
@@ -143,10 +144,14 @@ class _FreePoses:
         seen = zip(self.seen(*self.taken(steps)), self._rows, strict=True)
         return np.concatenate([(pixels - self.pixels[rows]).ravel() for pixels, rows in seen])
 
-    @property
+    @cached_property
     def _rows(self) -> list[NDArray[np.int64]]:
         of_points = self.estimator.of_points
         return [np.flatnonzero(of_points == number) for number in range(len(self.poses))]
+
+    @cached_property
+    def _points(self) -> list[BoundPoints]:
+        return [self.bound.take(rows) for rows in self._rows]
 
 
 def _each_alone(

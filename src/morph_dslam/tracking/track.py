@@ -162,9 +162,10 @@ def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
         wanted = run.first if number is None else number
-        every = SynchronizedFrames([open_source(path, None, None, run.fps, scale) for path, scale in recordings])
-        if run.other_cameras and every.goes_by_time:
-            return every.at(wanted)
+        if run.other_cameras:
+            every = SynchronizedFrames([open_source(path, None, None, run.fps, scale) for path, scale in recordings])
+            if every.goes_by_time:
+                return every.at(wanted)
         return tuple(frame_at(path, wanted, scale) for path, scale in recordings)
 
     sources = [open_source(path, run.first, run.last, run.fps, scale) for path, scale in recordings]
