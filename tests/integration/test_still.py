@@ -14,7 +14,7 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.camera_files import load_camera, save_camera
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
-from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks
 from morph_dslam.sources import open_source
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State

@@ -5,7 +5,7 @@ import pytest
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
-from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_registration import depth_term
 from morph_dslam.tracking.estimator import Estimator, State

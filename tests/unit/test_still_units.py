@@ -7,7 +7,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.refinement import Keyframe

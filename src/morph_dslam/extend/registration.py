@@ -14,7 +14,7 @@ from morph_dslam.registration.initialization import (
     InitializerFiles as InitializerFiles,
     register_by_initializer as register_by_initializer,
 )
-from morph_dslam.registration.landmarks import bind_landmarks as bind_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks as bind_landmarks
 from morph_dslam.registration.register import (
     draw_registration as draw_registration,
     registration_line as registration_line,

@@ -22,14 +22,14 @@ from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
 from morph_dslam.registration.guess import load_guess
 from morph_dslam.registration.hints import GuessedPose, Hints
-from morph_dslam.registration.landmarks import (
+from morph_dslam.registration.landmark_binding import (
     FEWEST_FOR_FIT,
     HINT_SURFACE_SHARE,
-    check_at_rest,
     check_pixels,
     check_spread,
     on_surface,
 )
+from morph_dslam.registration.landmark_fit import check_at_rest
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
 from morph_dslam.registration.mesh_error import mesh_error_factors, mesh_off_surface, with_mesh_error
 from morph_dslam.registration.messages import OnlyInBox, OtherSize

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import ParameterError, TrackingError
 from morph_dslam.io.text import PLAIN_NAME, PLAIN_NAME_RULE
 from morph_dslam.model import MaterialPoints, ReducedModel
-from morph_dslam.registration.landmarks import SURFACE_SHARE
+from morph_dslam.registration.landmark_binding import SURFACE_SHARE
 from morph_dslam.tracking.binding import nearest_surface_points
 
 Array = NDArray[np.float64]

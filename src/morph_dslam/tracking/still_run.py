@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model.model_errors import ModelErrors
-from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.depth_registration import depth_term

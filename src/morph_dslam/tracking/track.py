@@ -21,7 +21,7 @@ from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.model.shown_field import Shown
 from morph_dslam.notices import Remark
-from morph_dslam.registration.landmarks import bind_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.slam.camera_notes import camera_notes
 from morph_dslam.sources import Frame, open_live, open_source, open_stream

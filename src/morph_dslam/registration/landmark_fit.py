@@ -1,0 +1,240 @@
+"""Pose and parameters that explain landmarks, from all starts, and refusals where none do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import RegistrationError, RegistrationFailure
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.model import ReducedModel, SurfacePoints
+from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks
+from morph_dslam.registration.messages import NotAtRest
+from morph_dslam.registration.other_values import as_set, plausible_minima
+from morph_dslam.registration.plausible_states import MeasuredPoints
+from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
+from morph_dslam.registration.rig_check import cameras_contradict
+from morph_dslam.registration.starts import pose_starts, shape_starts
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, State
+from morph_dslam.tracking.rig import PointsEstimator, RigCamera
+
+Array = NDArray[np.float64]
+#: Least standard deviation of landmarks' pixels that is believed.
+LEAST_PX = 0.1
+#: Landmarks that fit so many times worse than carefully set ones, and worse than this share of the image's diagonal,
+#: are flagged; deviations are as wide as the fit asks for anyway.
+POOR_FIT, POOR_SHARE = 2.0, 1.0 / 800.0
+#: Largest residual (root mean square) as a share of the image's diagonal, and that of hints about an object whose edges
+#: give its place in the end: they need not be exact, but no mistakes.
+RESIDUAL_SHARE, HINT_RESIDUAL_SHARE = 0.005, 0.02
+
+
+@dataclass(frozen=True)
+class LandmarkFit:
+    """What landmarks alone say of the object.
+
+    Attributes
+    ----------
+    estimator : of pose and parameters from them; where the object is at rest, its parameters have no range.
+    landmarks : of all cameras.
+    plausible : estimates that explain them, which landmarks of the stated accuracy cannot exclude, the best first.
+    click_px : standard deviation of a carefully set landmark.
+    """
+
+    estimator: PointsEstimator
+    landmarks: BoundLandmarks
+    plausible: Sequence[Estimate]
+    click_px: float
+
+    @property
+    def best(self) -> Estimate:
+        return self.plausible[0]
+
+    @property
+    def covariance(self) -> Array:
+        """(d + 6, d + 6); a few landmarks that happen to fit well, or that a wrong model fits, are not exact for it."""
+        return self.best.covariance * as_set(self.best, self.click_px)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the best estimate's residuals."""
+        return _rms(self.best)
+
+    @property
+    def poor_px(self) -> float:
+        """Landmarks that fit worse than this are flagged."""
+        camera = self.estimator.camera
+        return max(POOR_FIT * self.click_px, POOR_SHARE * float(np.hypot(camera.width, camera.height)))
+
+    @property
+    def measured(self) -> MeasuredPoints:
+        """The landmarks as measurements, as exact as they fit or were set."""
+        pixels, variance = self.landmarks.pixels, max(self.click_px, self.best.sigma_px) ** 2
+        weights, normals = np.ones(len(self.landmarks)), np.zeros_like(pixels)
+        return MeasuredPoints(self.estimator, self.landmarks.points, pixels, weights, normals, variance)
+
+    def not_at_rest(self, shapes: Sequence[Array]) -> NotAtRest | None:
+        """That the object is hardly at rest, as was said; shapes (d,) are where else to begin."""
+        points, pixels = self.landmarks.points, self.landmarks.pixels
+        further = pose_starts(shapes, self.estimator, points, pixels)
+        least_share = 0.0 if self.best.sigma_px > self.poor_px else MOVED_SHARE
+        return not_at_rest(self.estimator, points, pixels, self.best, further, self.click_px, least_share)
+
+
+def fit_landmarks(
+    model: ReducedModel,
+    cameras: Sequence[RigCamera],
+    landmarks: BoundLandmarks,
+    click_px: float,
+    at_rest: bool = False,
+    near: State | None = None,
+) -> LandmarkFit:
+    """Explain landmarks by the object.
+
+    Parameters
+    ----------
+    model : of the object.
+    cameras : of the rig.
+    landmarks : in these.
+    click_px : standard deviation of a carefully set landmark.
+    at_rest : whether the parameters are their defaults.
+    near : a state close by that alone is started from; None for shapes spread over the parameters' ranges.
+
+    Raises RegistrationError if nothing explains them.
+    """
+    points, pixels = landmarks.points, landmarks.pixels
+    estimator = _estimator(model, cameras, landmarks, at_rest)
+    shapes = shape_starts(model)
+    if at_rest or 2 * len(landmarks) < len(model.parameters) + 6:
+        # Too few landmarks leave the shape at its default; the damped iteration departs no more than it must.
+        shapes = [model.default]
+    starts = list(pose_starts(shapes, estimator, points, pixels)) if near is None else [near]
+    found = _estimates(estimator, landmarks, starts)
+    if at_rest:
+        found = [_of_pose_alone(estimator, points, pixels, estimate) for estimate in found]
+    plausible = plausible_minima(found, click_px)
+    _check_residual(estimator, landmarks, plausible[0])
+    return LandmarkFit(estimator, landmarks, plausible, click_px)
+
+
+def check_at_rest(
+    model: ReducedModel, camera: Camera, surface: SurfacePoints, pixels: Array, numbers: NDArray[np.int64]
+) -> None:
+    """Refuse landmarks of one frame that contradict each other grossly: as hints they need not fit closely.
+
+    Parameters
+    ----------
+    model : of the object.
+    camera : that took the frame.
+    surface : the landmarks on the undeformed object, `FEWEST_FOR_FIT` or more.
+    pixels : (k, 2) where they were seen, without the lens's distortion.
+    numbers : (k,) theirs in the messages.
+    """
+    points = BoundPoints.from_surface(model, surface)
+    landmarks = BoundLandmarks(points, pixels, np.zeros(len(points), dtype=np.int64), numbers)
+    estimator = _estimator(model, [RigCamera(camera, RigidTransform.identity())], landmarks, at_rest=True)
+    best = _estimates(estimator, landmarks, list(pose_starts([model.default], estimator, points, pixels)))[0]
+    _check_residual(estimator, landmarks, best, HINT_RESIDUAL_SHARE)
+
+
+def without_parameters(covariance: Array) -> Array:
+    """A covariance (d + 6, d + 6) of a state whose parameters are known."""
+    known, d = np.zeros_like(covariance), len(covariance) - 6
+    known[d:, d:] = covariance[d:, d:]
+    return known
+
+
+def _estimator(
+    model: ReducedModel, cameras: Sequence[RigCamera], landmarks: BoundLandmarks, at_rest: bool
+) -> PointsEstimator:
+    options = EstimationOptions(huber_px=3.0, max_iterations=60)
+    estimator = PointsEstimator(model, cameras, landmarks.of_points, options)
+    if at_rest:
+        estimator.box = replace(estimator.box, lower=model.default, upper=model.default)
+    return estimator
+
+
+def _estimates(estimator: PointsEstimator, landmarks: BoundLandmarks, starts: list[State]) -> list[Estimate]:
+    """What explains landmarks, the best first; raises RegistrationError if nothing does."""
+    found = estimator.estimate_from(landmarks.points, landmarks.pixels, np.ones(len(landmarks)), starts)
+    found = [estimate for estimate in found if np.isfinite(estimate.residuals).all()]
+    if not found:
+        raise RegistrationError(
+            "no pose of the object explains the landmarks: check that points and pixels belong together",
+            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+        )
+    return found
+
+
+def _of_pose_alone(estimator: PointsEstimator, bound: BoundPoints, pixels: Array, found: Estimate) -> Estimate:
+    """An estimate whose parameters were known, with the covariance of the pose alone."""
+    d, covariance = len(estimator.model.parameters), np.zeros_like(found.covariance)
+    _, hessian, _, _ = estimator.evaluate(bound, pixels, np.ones(len(bound)), found.state)
+    freedom = max(2 * len(bound) - 6, 1)
+    variance = max(2.0 * found.cost / freedom, LEAST_PX**2)
+    scale = estimator.scale[d:]
+    covariance[d:, d:] = variance * np.outer(scale, scale) * np.linalg.pinv(hessian[d:, d:] * np.outer(scale, scale))
+    return replace(found, covariance=covariance, at_bound=np.zeros(d, dtype=bool), sigma_px=float(np.sqrt(variance)))
+
+
+def _rms(estimate: Estimate) -> float:
+    """Root mean square of the landmarks' residuals, pixels."""
+    return float(np.sqrt(np.mean(np.sum(estimate.residuals**2, axis=1))))
+
+
+def _check_residual(
+    estimator: PointsEstimator, landmarks: BoundLandmarks, best: Estimate, share: float = RESIDUAL_SHARE
+) -> None:
+    """Refuse landmarks if they do not fit to a share of the image's diagonal."""
+    camera = estimator.camera
+    rms, limit = _rms(best), share * float(np.hypot(camera.width, camera.height))
+    if rms <= limit:
+        return
+    if contradiction := cameras_contradict(estimator, landmarks.points, landmarks.pixels, best, limit, is_far=True):
+        raise RegistrationError(str(contradiction), RegistrationFailure.LANDMARKS_DO_NOT_FIT)
+    is_shape_known = np.array_equal(estimator.box.lower, estimator.box.upper)
+    wrong = _contradicted(estimator, landmarks, limit) if is_shape_known else None
+    if wrong is not None:
+        row, away, agreeing = wrong
+        raise RegistrationError(
+            f"landmark {landmarks.name(row)} is {away:.1f} px from where the other {len(landmarks) - 1} have it, which "
+            f"fit the object to {agreeing:.1f} px (at most {limit:.1f} px): check its point and its pixel",
+            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+        )
+    lengths = np.linalg.norm(best.residuals, axis=1)
+    worst = int(lengths.argmax())
+    shape = "the object has its mesh's shape there" if is_shape_known else "the model reaches this shape"
+    more = "; five or more show which of them is wrong" if is_shape_known and len(landmarks) == FEWEST_FOR_FIT else ""
+    raise RegistrationError(
+        f"the landmarks do not fit the object: their residual is {rms:.1f} px (root mean square, at most "
+        f"{limit:.1f} px), the worst is landmark {landmarks.name(worst)} with {lengths[worst]:.1f} px; check "
+        f"its pixel, the order of the landmarks, the camera file, and that {shape}{more}",
+        RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+    )
+
+
+def _contradicted(
+    estimator: PointsEstimator, landmarks: BoundLandmarks, limit: float
+) -> tuple[int, float, float] | None:
+    """The landmark without which the others fit an object of known shape to the limit; None if there is none.
+
+    Returns
+    -------
+    Its row, how far it is from where the others have it, and how they fit, pixels.
+    """
+    if len(landmarks) <= FEWEST_FOR_FIT:
+        return None
+    found = []
+    for row in range(len(landmarks)):
+        others = np.delete(np.arange(len(landmarks)), row)
+        kept, fewer = landmarks.take(others), estimator.taking(others)
+        starts = list(pose_starts([estimator.model.default], fewer, kept.points, kept.pixels))
+        for estimate in fewer.estimate_from(kept.points, kept.pixels, np.ones(len(kept)), starts)[:1]:
+            there = estimator.pixels(landmarks.points, estimate.state)[row]
+            found.append((_rms(estimate), row, float(np.linalg.norm(landmarks.pixels[row] - there))))
+    agreeing, row, away = min(found, default=(np.inf, 0, 0.0))
+    return (row, away, agreeing) if agreeing <= limit else None
