@@ -16,7 +16,7 @@ from morph_dslam.registration.board import BoardFile
 from morph_dslam.registration.guess import GuessFile
 from morph_dslam.registration.picture import PictureFile
 from morph_dslam.render.scene_file import Scene
-from morph_dslam.slam.run import write_run as write_slam_run
+from morph_dslam.slam.run_files import write_run as write_slam_run
 from morph_dslam.slam.scene import finish_scene
 from morph_dslam.slam.slam import Slam
 from morph_dslam.studies.external import ExternalStudy

@@ -17,7 +17,7 @@ from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
-from morph_dslam.tracking.multi_camera import RigErrors
+from morph_dslam.tracking.rig_errors import RigErrors
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera, RigEstimator

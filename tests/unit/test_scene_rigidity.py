@@ -15,7 +15,7 @@ from morph_dslam.slam.camera_terms import CameraEstimate, TermEstimate
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
-from morph_dslam.slam.run import write_run
+from morph_dslam.slam.run_files import write_run
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.slam.scene_rigidity import SceneNotRigid, motion_in_scene, neighbours_share, without_smooth_field
 from morph_dslam.slam.slam import Slam

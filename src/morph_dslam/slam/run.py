@@ -2,45 +2,66 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import meshio
-import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-
-from morph_dslam.camera import Camera
+from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
-from morph_dslam.io.colmap import ColmapImage, ColmapModel, read_colmap_model, write_colmap_model
+from morph_dslam.io.colmap import ColmapModel, read_colmap_model
 from morph_dslam.io.folders import make_run_folder, only_writer
-from morph_dslam.io.trajectory import Trajectory, load_trajectory, save_trajectory
+from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.io.video import VideoWriter
-from morph_dslam.slam.camera_terms import CameraEstimate, CameraTerm, with_terms_of
+from morph_dslam.slam.camera_terms import CameraTerm, with_terms_of
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.options import SlamOptions
-from morph_dslam.slam.result import STAGES, SlamFrame
-from morph_dslam.slam.rigid_map import GOOD
+from morph_dslam.slam.result import SlamFrame
+from morph_dslam.slam.run_files import draw_frame, write_run
 from morph_dslam.slam.scene import Scene, finish_scene, load_scene, refine_camera, start_slam, track_frames
-from morph_dslam.slam.scene_rigidity import SceneNotRigid
-from morph_dslam.sources import FrameSource, open_source, open_stream
+from morph_dslam.slam.slam import Slam
+from morph_dslam.sources import FrameSource, FrameStream, open_source, open_stream
 from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream
 
-Array = NDArray[np.float64]
-DPI = 110
-PATH_COLOUR, POINT_COLOUR = "#b4530a", "#8fb3d9"
-#: Blue, green, red of what the video shows.
-INLIER, CANDIDATE, DISAGREEING = (80, 200, 60), (200, 150, 40), (40, 40, 230)
+
+@dataclass(frozen=True)
+class _Start:
+    """What a run begins with beside its source; see `run_slam`."""
+
+    map_path: Path | None
+    trajectory: Path | None
+    images: Path | None
+
+    @property
+    def is_model(self) -> bool:
+        """Whether the map is the folder of a COLMAP model."""
+        path = self.map_path
+        return path is not None and path.is_dir() and not (path / "map.h5").is_file()
+
+    def check(self, options: SlamOptions, refine: Sequence[CameraTerm]) -> None:
+        """Raise MapError if the choices contradict each other."""
+        if options.extend and self.map_path is None and self.trajectory is None:
+            raise MapError("--extend needs the map that is to grow: --map run/map.h5")
+        if self.map_path is not None and self.trajectory is not None:
+            raise MapError("a map comes either from --map or from --trajectory, not from both")
+        if self.images is not None and self.trajectory is None and not self.is_model:
+            raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
+        if refine and (self.map_path is not None or self.trajectory is not None):
+            raise MapError("--refine-camera makes a new map: leave out --map and --trajectory")
+
+    def known(self, camera: Camera | StereoCamera) -> Scene | Trajectory | ColmapModel | None:
+        """The map, or poses to make it with, if there are any."""
+        if self.trajectory is not None:
+            return load_trajectory(self.trajectory)
+        if self.map_path is None:
+            return None
+        if self.is_model:
+            return read_colmap_model(self.map_path)
+        return load_scene(self.map_path, FrameImages(camera).camera)
 
 
 def run_slam(
@@ -91,35 +112,19 @@ def run_slam(
     Raises MorphError if an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
     (TrackingError).
     """
-    options = options or SlamOptions()
-    is_model = map_path is not None and map_path.is_dir() and not (map_path / "map.h5").is_file()
-    if options.extend and map_path is None and trajectory is None:
-        raise MapError("--extend needs the map that is to grow: --map run/map.h5")
-    if map_path is not None and trajectory is not None:
-        raise MapError("a map comes either from --map or from --trajectory, not from both")
-    if images is not None and trajectory is None and not is_model:
-        raise MapError("--images says what a COLMAP model (--map MODEL) or poses (--trajectory) are of")
-    if refine and (map_path is not None or trajectory is not None):
-        raise MapError("--refine-camera makes a new map: leave out --map and --trajectory")
+    options, start = options or SlamOptions(), _Start(map_path, trajectory, images)
+    start.check(options, refine)
     one_or_two = load_camera_or_pair(camera)
     stream = open_stream(source, first, last, fps, depth_per_metre)
+    more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
+    if depth_per_metre is not None:
+        more["inputs"]["depth_per_metre"] = depth_per_metre
     with stream if isinstance(stream, LiveStream) else nullcontext(), only_writer(output):
         make_run_folder(output, overwrite, "trajectory.txt")
-        known: Scene | Trajectory | ColmapModel | None = None
-        refined: CameraEstimate | None = None
-        kept = set[CameraTerm]()
         if refine:
-            if not isinstance(stream, FrameSource) or not isinstance(one_or_two, Camera):
-                raise MapError("--refine-camera needs a recording of one camera, no live camera and no stereo pair")
-            given, refined = one_or_two, refine_camera(stream, one_or_two, refine, options, progress)
-            kept = {term for term in refine if with_terms_of(refined.camera, given, (term,)) == refined.camera}
-            one_or_two = refined.camera
+            one_or_two, more["refined_camera"] = _refined(stream, one_or_two, refine, options, progress)
             save_camera(output / "camera.yaml", one_or_two)
-        if trajectory is not None:
-            known = load_trajectory(trajectory)
-        elif map_path is not None:
-            known = read_colmap_model(map_path) if is_model else load_scene(map_path, FrameImages(one_or_two).camera)
-        recorded = None
+        known, recorded = start.known(one_or_two), None
         if isinstance(known, Trajectory | ColmapModel):
             recorded = open_source(images or source, fps=None if images else fps)
         if progress:
@@ -128,13 +133,9 @@ def run_slam(
         notes = notes_of_source(stream, slam.camera.readout_s)
         again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0
-        size = (slam.camera.width, slam.camera.height)
         try:
-            with VideoWriter(output / "tracked.mp4", stream.fps, size) if video else nullcontext() as writer:
-                watch = (lambda image, frame: writer.write(draw_frame(image, frame))) if writer else None
-                for frame in track_frames(slam, stream, progress, watch):
-                    frames.append(frame)
-                again = stream if isinstance(stream, FrameSource) and known is None else None
+            _track(slam, stream, frames, output / "tracked.mp4" if video else None, progress)
+            again = stream if isinstance(stream, FrameSource) and known is None else None
         except MapError:
             frames.clear()  # nothing of a run whose depth contradicts the map may replace an earlier one
             raise
@@ -143,13 +144,6 @@ def run_slam(
                 raise
             raise SourceError(f"{error}; the {len(frames)} frames before it are in {output}") from error
         finally:
-            more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
-            if depth_per_metre is not None:
-                more["inputs"]["depth_per_metre"] = depth_per_metre
-            if refined is not None:
-                more["refined_camera"] = {
-                    term: found.facts() | {"is_kept": term in kept} for term, found in refined.terms.items()
-                }
             if isinstance(stream, LiveStream):
                 more["n_dropped"] = stream.dropped - n_before
             summary: dict[str, Any] = {}
@@ -159,125 +153,21 @@ def run_slam(
     return summary
 
 
-def write_run(folder: Path, scene: Scene, more: dict[str, Any], notes: Sequence[str] = ()) -> dict[str, Any]:
-    """Write all files but the video; returns the content of ``summary.json``, which has ``more`` and the notes."""
-    save_trajectory(folder / "trajectory.txt", scene.trajectory)
-    meshio.Mesh(scene.points, []).write(folder / "map.ply")
-    _write_colmap(folder / "colmap", scene)
-    _write_csv(folder / "frames.csv", scene)
-    scene.save(folder / "map.h5")
-    plots = folder / "plots"
-    plots.mkdir(exist_ok=True)
-    _plot_trajectory(plots / "trajectory.png", scene)
-    _plot_frames(plots / "frames.png", scene.frames)
-    summary = scene.summary() | more
-    summary["flags"] = [*notes, *summary["flags"]]
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
-    return summary
+def _refined(
+    stream: FrameStream, given: Camera | StereoCamera, terms: Sequence[CameraTerm], options: SlamOptions, progress: bool
+) -> tuple[Camera, dict[str, Any]]:
+    """The camera with terms estimated from the recording, and what ``summary.json`` says of each."""
+    if not isinstance(stream, FrameSource) or not isinstance(given, Camera):
+        raise MapError("--refine-camera needs a recording of one camera, no live camera and no stereo pair")
+    refined = refine_camera(stream, given, terms, options, progress)
+    kept = {term for term in terms if with_terms_of(refined.camera, given, (term,)) == refined.camera}
+    return refined.camera, {term: found.facts() | {"is_kept": term in kept} for term, found in refined.terms.items()}
 
 
-def _write_colmap(folder: Path, scene: Scene) -> None:
-    """The map's points and keyframes as a COLMAP model."""
-    good = scene.map.state == GOOD
-    rows = np.cumsum(good) - 1
-    images = []
-    for keyframe in scene.keyframes:
-        seen = keyframe.seen[good[keyframe.point_ids]]
-        name = f"{keyframe.index:06d}.png"
-        images.append(ColmapImage(name, keyframe.camera_from_world, rows[seen.ids], seen.pixels))
-    write_colmap_model(folder, scene.camera, images, scene.points)
-
-
-def _write_csv(path: Path, scene: Scene) -> None:
-    header = ["frame", "timestamp_s", "status", "reason", *"xyz", "qx", "qy", "qz", "qw"]
-    header += ["position_std", "rotation_std_deg", "rms_px", "n_points", "n_candidates", "n_disagreeing"]
-    header += ["is_keyframe", *(f"{stage}_ms" for stage in STAGES), "total_ms"]
-    poses = dict(zip(scene.trajectory.indices.tolist(), scene.trajectory.world_from_camera, strict=True))
-    # In a map that follows what moves, residuals of a frame do not tell how far its pose is off.
-    unknown = any(isinstance(notice, SceneNotRigid) for notice in scene.notices)
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for frame in scene.frames:
-            row: list[Any] = [frame.index, f"{frame.timestamp:.6f}", frame.status, frame.reason or ""]
-            row += _pose_columns(poses[frame.index], frame, unknown) if frame.index in poses else [""] * 10
-            row += [frame.n_points, frame.n_candidates, frame.n_disagreeing]
-            row += [int(frame.is_keyframe), *(f"{frame.timings_ms[s]:.3f}" for s in STAGES)]
-            writer.writerow([*row, f"{frame.total_ms:.3f}"])
-
-
-def _pose_columns(world_from_camera: Array, frame: SlamFrame, unknown: bool) -> list[str]:
-    assert frame.pose is not None
-    variances = np.full(6, np.inf) if unknown else np.diag(frame.pose.covariance)
-    quaternion = Rotation.from_matrix(world_from_camera[:3, :3]).as_quat(canonical=True)
-    deviations = [np.sqrt(variances[3:].sum()), np.degrees(np.sqrt(variances[:3].sum()))]
-    return [
-        *(f"{value:.6f}" for value in (*world_from_camera[:3, 3], *quaternion)),
-        *(f"{value:.3g}" for value in deviations),
-        f"{frame.pose.rms_px:.4f}",
-    ]
-
-
-def _plot_trajectory(path: Path, scene: Scene) -> None:
-    """The path and the map from above and from the side, as the first view stands."""
-    points, unit = scene.points, "m" if scene.is_metric else "map unit"
-    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
-    if len(points):
-        # A few distant points would shrink everything else.
-        low, high = np.percentile(points, [2, 98], axis=0)
-        points = points[((points >= low) & (points <= high)).all(axis=1)]
-    for axes, vertical, name in zip(figure.subplots(1, 2), (2, 1), ("from above", "from the front"), strict=True):
-        axes.plot(points[:, 0], points[:, vertical], ".", color=POINT_COLOUR, markersize=2, label="map points")
-        path_points = scene.trajectory.positions
-        axes.plot(path_points[:, 0], path_points[:, vertical], color=PATH_COLOUR, linewidth=1.4, label="camera")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_xlabel(f"x [{unit}]")
-        axes.set_ylabel(f"{'xyz'[vertical]} [{unit}]")
-        axes.set_title(name, fontsize=10)
-        if vertical == 1:
-            axes.invert_yaxis()
-    figure.axes[0].legend(fontsize=8, frameon=False)
-    figure.savefig(path, dpi=DPI)
-
-
-def _plot_frames(path: Path, frames: Sequence[SlamFrame]) -> None:
-    """Points, errors and times of every frame."""
-    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    counts, errors, times = figure.subplots(3, 1, sharex=True)
-    numbers = [frame.index for frame in frames]
-    counts.plot(numbers, [f.n_points for f in frames], color=PATH_COLOUR, label="map points")
-    counts.plot(numbers, [f.n_candidates for f in frames], color=POINT_COLOUR, label="corners without depth")
-    counts.set_ylabel("points followed")
-    counts.legend(fontsize=8, frameon=False)
-    errors.plot(numbers, [f.pose.rms_px if f.pose else np.nan for f in frames], color=PATH_COLOUR)
-    errors.set_ylabel("RMS error [px]")
-    times.plot(numbers, [f.total_ms for f in frames], color=POINT_COLOUR, linewidth=0.9)
-    keyframes = [f for f in frames if f.is_keyframe]
-    times.plot([f.index for f in keyframes], [f.total_ms for f in keyframes], ".", color=PATH_COLOUR)
-    times.set_ylabel("time [ms]")
-    times.legend(["frame", "keyframe"], fontsize=8, frameon=False)
-    times.set_xlabel("frame")
-    for axes in (counts, errors, times):
-        axes.set_ylim(bottom=0.0)
-        for frame in frames:
-            if frame.pose is None:
-                axes.axvspan(frame.index - 0.5, frame.index + 0.5, color="#d9534f", alpha=0.15, linewidth=0)
-    figure.savefig(path, dpi=DPI)
-
-
-def draw_frame(image: NDArray[np.uint8], frame: SlamFrame) -> NDArray[np.uint8]:
-    """The undistorted image (h, w, 3) with map points green, corners blue, what disagrees red."""
-    drawn = image.copy()
-    size = max(1.0, image.shape[0] / 480)  # of what is drawn, so that it stays as large beside a larger picture
-    for pixels, colour in (
-        (frame.candidates, CANDIDATE),
-        (frame.points.pixels, INLIER),
-        (frame.disagreeing.pixels, DISAGREEING),
-    ):
-        for x, y in np.rint(pixels).astype(int).tolist():
-            cv2.circle(drawn, (x, y), round(2 * size), colour, -1, cv2.LINE_AA)
-    text, corner = f"{frame.index}  {frame.status}  {frame.reason or ''}", (round(8 * size), round(18 * size))
-    for thickness, grey in ((3, 0), (1, 255)):
-        width = round(thickness * size)
-        cv2.putText(drawn, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * size, (grey, grey, grey), width, cv2.LINE_AA)
-    return drawn
+def _track(slam: Slam, stream: FrameStream, frames: list[SlamFrame], video: Path | None, progress: bool) -> None:
+    """Add each frame's record to ``frames``, which keeps them if the source ends early, and draw the video."""
+    size = (slam.camera.width, slam.camera.height)
+    with VideoWriter(video, stream.fps, size) if video else nullcontext() as writer:
+        watch = (lambda image, frame: writer.write(draw_frame(image, frame))) if writer else None
+        for frame in track_frames(slam, stream, progress, watch):
+            frames.append(frame)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_estimation import new_filter
 from morph_dslam.tracking.frame_results import with_flat_sides, with_model_errors
 from morph_dslam.tracking.hypothesis import Image
-from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions
 from morph_dslam.tracking.outcomes import (
@@ -42,7 +41,8 @@ from morph_dslam.tracking.outcomes import (
 )
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
-from morph_dslam.tracking.systematic_errors import SystematicErrors, Unexplained, error_factors_of, inverse_of_seen
+from morph_dslam.tracking.rig_errors import RigErrors
+from morph_dslam.tracking.systematic_errors import Unexplained, error_factors_of
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from morph_dslam.tracking.tracker_inputs import check_pose, check_tracker
 from morph_dslam.tracking.views import KeyframeViews
@@ -52,115 +52,6 @@ Array = NDArray[np.float64]
 
 #: Why several cameras refuse an object whose outline is all there is.
 NO_TEXTURE = "the object shows too few corners, and its outline alone is followed with one camera: leave out --with"
-
-
-@dataclass(frozen=True)
-class _View:
-    """What one camera measured, about the common estimate.
-
-    Attributes
-    ----------
-    chain : (d + 6, d + 6) from increments in the rig's frame to those in the camera's.
-    systematic : errors of the camera's points.
-    estimate : in the camera's frame, with the residuals of its texture's points only.
-    weights : (p,) of these, zero for those that do not count.
-    """
-
-    chain: Array
-    systematic: SystematicErrors
-    estimate: Estimate
-    weights: Array
-
-    @property
-    def unexplained(self) -> Unexplained:
-        """What the common estimate leaves of the camera's residuals."""
-        return self.systematic.unexplained(self.estimate, self.weights > 0.0)
-
-
-class RigErrors:
-    """Adds to covariances what the reference state, and the model, are off by.
-
-    As for one camera (`systematic_errors`), an error e of the reference state enters each estimate through the
-    points that were bound by it. Each camera sees e as C e, with C its chain from increments in the rig's frame
-    to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In other
-    reference images of the undeformed object the same error factors make another e each. What neighbouring points
-    of a camera's image have in common in the residuals enters as for one camera, each camera's by itself.
-
-    Parameters
-    ----------
-    trackers : by camera, each at its one reference view, which knows how its images are off by the error
-        factors that are the same for all.
-    cameras : of the rig.
-    """
-
-    def __init__(self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera]) -> None:
-        parts = [part for tracker in trackers for part in tracker.reference.parts]
-        self._is_known = all(part.error_factors is not None for part in parts)
-        self._cameras, self._scale = cameras, trackers[0].estimator.scale
-        self._chains = [part.chain(len(self._scale) - 6) for part in cameras]
-        self._systematic = [
-            SystematicErrors(tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW)
-            for tracker in trackers
-        ]
-        self._counts = [len(tracker.reference.points) for tracker in trackers]
-
-    def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
-        """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
-
-        It has several causes: the model's error, the rig's calibration, and images that are not of one instant.
-        """
-        return [view.unexplained for view in self._views(estimate, measured)]
-
-    def added(
-        self,
-        estimate: Estimate,
-        measured: RigObservations,
-        prior: Prior | None,
-        common_px: Sequence[float],
-        blurred: Sequence[Array | None] | None = None,
-    ) -> Estimate:
-        """The estimate with a covariance that holds both errors, and that of motion blur.
-
-        Parameters
-        ----------
-        estimate : a state in the rig's frame.
-        measured : what it was made from.
-        prior : what was known of the frame's pose.
-        common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
-        blurred : by camera (p, 2), the paths over which motion smears the points, pixels; None where it does no harm,
-            or for all.
-        """
-        views = self._views(estimate, measured)
-        frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
-        both = list(zip(views, frames, strict=True))
-        hessian = np.sum([view.chain.T @ frame.hessian @ view.chain for view, frame in both], axis=0)
-        if prior is not None:
-            hessian = hessian + prior.terms(estimate.state)[1]
-        gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
-        stated = covariance
-        for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
-            moved = view.systematic.pushed_by_model(frame, view.chain, gain, px)
-            covariance = covariance + moved @ moved.T
-            if paths is not None:
-                moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
-                covariance = covariance + moved @ moved.T
-        if self._is_known:
-            pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
-            transfer = gain @ np.sum(pushes, axis=0)
-            covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
-        return replace(estimate, covariance=covariance, stated_covariance=stated)
-
-    def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
-        views, first = [], 0
-        for part, chain, systematic, count, view in zip(
-            self._cameras, self._chains, self._systematic, self._counts, measured.views, strict=True
-        ):
-            seen = replace(
-                estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
-            )
-            views.append(_View(chain, systematic, seen, view.weights[:count]))
-            first += len(view.weights)
-        return views
 
 
 #: A camera of which a smaller share of the points agrees with all cameras together contradicts them.
@@ -285,26 +176,14 @@ class RigTracker:
             If a picture or its depth is not of its camera's size, or of another type.
         """
         where = localization or CameraLocalization()
-        known, results = where.pose_prior, []
-        time = next((frame.timestamp for frame in frames if isinstance(frame, Frame)), None)
-        for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
-            if frame is None or isinstance(frame, MissingFrame):
-                results.append(tracker.pass_over(time if frame is None else frame.timestamp))
-                continue
-            if isinstance(frame, Frame):
-                part.camera.checked_picture(frame.image, f"frame {frame.index} of camera {number}")
-            seen = CameraLocalization(None if known is None else part.seen_pose(known))
-            results.append(tracker.track(frame, seen, None if occluder_depths is None else occluder_depths[number]))
+        known, results = where.pose_prior, self._each(frames, where.pose_prior, occluder_depths)
         has_moved = any(result.warning(ObjectMoved) is not None for result in results)
         prior = None if known is None or has_moved else self._prior(known, results)
         with frame_clock(STAGES) as clock, stage("fuse"):
             estimate, measured, rejection = self._together(results, prior)
             left: list[Unexplained] = []
             if estimate is not None:
-                left = self._errors.unexplained(estimate, measured)
-                blurred = [tracker.last_blurred for tracker in self.trackers]
-                common = [rest.px if p is None else rest.total_px for rest, p in zip(left, blurred, strict=True)]
-                estimate = self._errors.added(estimate, measured, prior, common, blurred)
+                estimate, left = self._with_errors(estimate, measured, prior)
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
@@ -328,12 +207,52 @@ class RigTracker:
             return result
         for tracker, part in zip(self.trackers, self.cameras, strict=True):
             tracker.continue_from(part.seen(estimate.state))
+        result = replace(result, pose_from=PoseSource.POINTS if prior is None else PoseSource.POINTS_AND_MAP)
+        return self._found(result, estimate, measured, results, left)
+
+    def _each(
+        self,
+        frames: Sequence[Frame | NDArray[np.uint8] | None],
+        known: PosePrior | None,
+        occluder_depths: Sequence[NDArray[np.float32]] | None,
+    ) -> list[FrameResult]:
+        """What each camera finds by itself; parameters as of `track`, with the map's pose in the rig's frame."""
+        results = []
+        time = next((frame.timestamp for frame in frames if isinstance(frame, Frame)), None)
+        for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
+            if frame is None or isinstance(frame, MissingFrame):
+                results.append(tracker.pass_over(time if frame is None else frame.timestamp))
+                continue
+            if isinstance(frame, Frame):
+                part.camera.checked_picture(frame.image, f"frame {frame.index} of camera {number}")
+            seen = CameraLocalization(None if known is None else part.seen_pose(known))
+            results.append(tracker.track(frame, seen, None if occluder_depths is None else occluder_depths[number]))
+        return results
+
+    def _with_errors(
+        self, estimate: Estimate, measured: RigObservations, prior: Prior | None
+    ) -> tuple[Estimate, list[Unexplained]]:
+        """The common estimate with the errors in its covariance, and what it leaves of each camera's residuals."""
+        left = self._errors.unexplained(estimate, measured)
+        blurred = [tracker.last_blurred for tracker in self.trackers]
+        common = [rest.px if p is None else rest.total_px for rest, p in zip(left, blurred, strict=True)]
+        return self._errors.added(estimate, measured, prior, common, blurred), left
+
+    def _found(
+        self,
+        lost: FrameResult,
+        estimate: Estimate,
+        measured: RigObservations,
+        results: list[FrameResult],
+        left: list[Unexplained],
+    ) -> FrameResult:
+        """A result of the common estimate, in place of the one that would stand without it."""
         used = measured.weights > 0.0
         recovered = all(result.recovered or result.estimate is None for result in results)
         found = replace(
-            result,
+            lost,
             warnings=(
-                *warnings,
+                *lost.warnings,
                 *([PastForgotten()] if self._filter.forgot else []),
                 *_blurred(results),
                 *_not_explained(results, left),
@@ -342,7 +261,6 @@ class RigTracker:
             status=Status.TRACKED,
             estimate=estimate,
             found_by=FoundBy.LAST_STATE if recovered else FoundBy.FLOW,
-            pose_from=PoseSource.POINTS if prior is None else PoseSource.POINTS_AND_MAP,
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
         )

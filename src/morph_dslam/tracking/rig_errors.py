@@ -1,0 +1,127 @@
+"""What the reference state and the model are off by, in estimates from several cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morph_dslam.tracking.estimator import Estimate, Prior
+from morph_dslam.tracking.measurement import PATCH_WINDOW
+from morph_dslam.tracking.noise import RigObservations
+from morph_dslam.tracking.rig import RigCamera
+from morph_dslam.tracking.systematic_errors import SystematicErrors, Unexplained, inverse_of_seen
+from morph_dslam.tracking.tracker import Tracker
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _View:
+    """What one camera measured, about the common estimate.
+
+    Attributes
+    ----------
+    chain : (d + 6, d + 6) from increments in the rig's frame to those in the camera's.
+    systematic : errors of the camera's points.
+    estimate : in the camera's frame, with the residuals of its texture's points only.
+    weights : (p,) of these, zero for those that do not count.
+    """
+
+    chain: Array
+    systematic: SystematicErrors
+    estimate: Estimate
+    weights: Array
+
+    @property
+    def unexplained(self) -> Unexplained:
+        """What the common estimate leaves of the camera's residuals."""
+        return self.systematic.unexplained(self.estimate, self.weights > 0.0)
+
+
+class RigErrors:
+    """Adds to covariances what the reference state, and the model, are off by.
+
+    As for one camera (`systematic_errors`), an error e of the reference state enters each estimate through the
+    points that were bound by it. Each camera sees e as C e, with C its chain from increments in the rig's frame
+    to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In other
+    reference images of the undeformed object the same error factors make another e each. What neighbouring points
+    of a camera's image have in common in the residuals enters as for one camera, each camera's by itself.
+
+    Parameters
+    ----------
+    trackers : by camera, each at its one reference view, which knows how its images are off by the error
+        factors that are the same for all.
+    cameras : of the rig.
+    """
+
+    def __init__(self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera]) -> None:
+        parts = [part for tracker in trackers for part in tracker.reference.parts]
+        self._is_known = all(part.error_factors is not None for part in parts)
+        self._cameras, self._scale = cameras, trackers[0].estimator.scale
+        self._chains = [part.chain(len(self._scale) - 6) for part in cameras]
+        self._systematic = [
+            SystematicErrors(tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW)
+            for tracker in trackers
+        ]
+        self._counts = [len(tracker.reference.points) for tracker in trackers]
+
+    def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
+        """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
+
+        It has several causes: the model's error, the rig's calibration, and images that are not of one instant.
+        """
+        return [view.unexplained for view in self._views(estimate, measured)]
+
+    def added(
+        self,
+        estimate: Estimate,
+        measured: RigObservations,
+        prior: Prior | None,
+        common_px: Sequence[float],
+        blurred: Sequence[Array | None] | None = None,
+    ) -> Estimate:
+        """The estimate with a covariance that holds both errors, and that of motion blur.
+
+        Parameters
+        ----------
+        estimate : a state in the rig's frame.
+        measured : what it was made from.
+        prior : what was known of the frame's pose.
+        common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
+        blurred : by camera (p, 2), the paths over which motion smears the points, pixels; None where it does no harm,
+            or for all.
+        """
+        views = self._views(estimate, measured)
+        frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
+        both = list(zip(views, frames, strict=True))
+        hessian = np.sum([view.chain.T @ frame.hessian @ view.chain for view, frame in both], axis=0)
+        if prior is not None:
+            hessian = hessian + prior.terms(estimate.state)[1]
+        gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
+        stated = covariance
+        for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
+            moved = view.systematic.pushed_by_model(frame, view.chain, gain, px)
+            covariance = covariance + moved @ moved.T
+            if paths is not None:
+                moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
+                covariance = covariance + moved @ moved.T
+        if self._is_known:
+            pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
+            transfer = gain @ np.sum(pushes, axis=0)
+            covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
+        return replace(estimate, covariance=covariance, stated_covariance=stated)
+
+    def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
+        views, first = [], 0
+        for part, chain, systematic, count, view in zip(
+            self._cameras, self._chains, self._systematic, self._counts, measured.views, strict=True
+        ):
+            seen = replace(
+                estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
+            )
+            views.append(_View(chain, systematic, seen, view.weights[:count]))
+            first += len(view.weights)
+        return views
