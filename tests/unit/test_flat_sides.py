@@ -11,7 +11,7 @@ import morph_dslam as md
 from morph_dslam.errors import IdentificationError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.identification.identify import identify
-from morph_dslam.identification.measurements import MeasuredPoints
+from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.flat_sides import FlatSides, reach
 from morph_dslam.tracking.frame_results import with_flat_sides

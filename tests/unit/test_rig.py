@@ -17,10 +17,10 @@ from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
-from morph_dslam.tracking.rig_errors import RigErrors
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
+from morph_dslam.tracking.rig_errors import RigErrors
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import measured

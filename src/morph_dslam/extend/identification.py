@@ -6,13 +6,9 @@ from morph_dslam.identification.identify import (
     Misfit as Misfit,
     identify as identify,
 )
-from morph_dslam.identification.measurements import (
-    FEWEST_FORCES as FEWEST_FORCES,
-    MeasuredForces as MeasuredForces,
-    MeasuredPoints as MeasuredPoints,
-    Measurement as Measurement,
-    load_points as load_points,
-)
+from morph_dslam.identification.measured_forces import FEWEST_FORCES as FEWEST_FORCES, MeasuredForces as MeasuredForces
+from morph_dslam.identification.measured_points import MeasuredPoints as MeasuredPoints, load_points as load_points
+from morph_dslam.identification.measurements import Measurement as Measurement
 from morph_dslam.identification.prior import KnownValues as KnownValues
 from morph_dslam.identification.report import (
     check_no_identification as check_no_identification,

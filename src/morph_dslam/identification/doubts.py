@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force_notices import ForceNotice, OtherFrameNumbers, OtherSize, force_notices
 from morph_dslam.evaluation.likeness import Likeness
-from morph_dslam.identification.measurements import MeasuredForces
+from morph_dslam.identification.measured_forces import MeasuredForces
 
 Array = NDArray[np.float64]
 #: Changes of a force below this share of it are rounding.

@@ -21,7 +21,8 @@ from scipy.stats import norm, qmc, t
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.doubts import check_size
-from morph_dslam.identification.measurements import MeasuredForces, Measurement
+from morph_dslam.identification.measured_forces import MeasuredForces
+from morph_dslam.identification.measurements import Measurement
 from morph_dslam.identification.prior import KnownValues
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.flat_sides import LOOK, flat_variance

@@ -12,7 +12,7 @@ import numpy as np
 
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.identify import Misfit
-from morph_dslam.identification.measurements import MeasuredPoints
+from morph_dslam.identification.measured_points import MeasuredPoints
 
 #: A state is missed where more than this part of its own change is left.
 MOST_MISSED = 0.5

@@ -17,7 +17,8 @@ from morph_dslam.evaluation.force import SMALL_SHARE, noticed, reaction_remark
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.doubts import notices
 from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
-from morph_dslam.identification.measurements import MeasuredForces, MeasuredPoints
+from morph_dslam.identification.measured_forces import MeasuredForces
+from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.missed_states import missed_state_notes, state_figures
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
