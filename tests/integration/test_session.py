@@ -23,7 +23,7 @@ from morph_dslam.sources.live import PacedRecording
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
-from morph_dslam.tracking.outcomes import RejectionReason, SamePlace
+from morph_dslam.tracking.outcomes import CameraIgnored, KnownRefuted, RejectionReason, SamePlace
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
@@ -284,6 +284,28 @@ def test_a_covered_camera_goes_on_from_the_other(model, rig_films):
     assert rig.trackers[1].last_measured.weights.sum() > 100
 
 
+def test_a_sensor_tells_a_rig_of_a_parameter_and_is_named_when_the_images_refute_it(model, rig_films):
+    """Its readings have another zero in the last three frames; the first camera is covered in two before."""
+    rig, random, sensor_std = new_rig(model, images(rig_films, 0.0)), np.random.default_rng(2), 2e-4
+    for number, time in enumerate(RIG_TIMES):
+        truth, zero, seen = sheet_state(time).parameters[0], -0.02 if number >= 6 else 0.0, images(rig_films, time)
+        if number in (2, 3):
+            seen[0] = rig_films[0].blank()
+        rig.know({"arch": (truth + zero + sensor_std * random.standard_normal(), sensor_std)})
+        result = rig.track(seen)
+        assert result.status is md.Status.TRACKED, result.reason
+        assert result.estimate.state.parameters[0] == pytest.approx(truth + zero, abs=4.0 * sensor_std)
+        if not zero:
+            assert result.estimate.parameter_std[0] < sensor_std
+        warnings = [warning for warning in result.warnings if not isinstance(warning, CameraIgnored)]
+        assert [type(warning) for warning in warnings] == ([KnownRefuted] if zero else [])
+        for warning in warnings:
+            assert float(warning.found.removesuffix(" mm")) == pytest.approx(1e3 * truth, abs=2.0)
+    rig.know({})
+    result = rig.track(images(rig_films, time))
+    assert result.estimate.state.parameters[0] == pytest.approx(truth, abs=4.0 * result.estimate.parameter_std[0])
+
+
 def test_an_object_that_no_camera_sees_is_lost(model, rig_films):
     result = new_rig(model, images(rig_films, 0.0)).track([film.blank() for film in rig_films])
     assert result.status is md.Status.LOST
@@ -391,6 +413,19 @@ def with_both_cameras(folder, output, *more, camera="camchain.yaml#cam0"):
         "track", folder / "front", "--with", folder / "aside", "--camera", f"{folder}/{camera}",
         "--model", folder / "sheet.morph", "--landmarks", folder / "landmarks.csv", "-o", output, *more,
     ]  # fmt: skip
+
+
+def test_what_a_sensor_knows_counts_with_both_cameras_too(rig_recording_of_sheet, tmp_path, capsys):
+    """A twist that is a degree off in one frame, with little deviation, and right in all others."""
+    times, folder = [0.0, *RIG_TIMES[:4]], rig_recording_of_sheet
+    twists = [np.degrees(sheet_state(time).parameters[2]) + (number == 3) for number, time in enumerate(times)]
+    rows = [f"{number},{twist},0.01" for number, twist in enumerate(twists)]
+    (tmp_path / "known.csv").write_text("\n".join(["frame,twist_deg,twist_std_deg", *rows]))
+    told = "--known", tmp_path / "known.csv", "--no-video"
+    assert run_command(with_both_cameras(folder, tmp_path / "run", *told)) == 0
+    run = load_run(tmp_path / "run")
+    assert np.degrees(run.parameters[:, 2]) == pytest.approx(twists, abs=0.0301)
+    assert "refute the known values of 'twist' in 1 of 5 frames, first in frame 3" in capsys.readouterr().out
 
 
 def assert_follows_the_sheet(run, model):

@@ -142,6 +142,25 @@ def test_parameter_over_the_sequence_sharpens_with_a_rig():
     assert abs(estimate.state.parameters[2] - TRUTH.parameters[2]) < 4.0 * deviations[-1]
 
 
+def test_what_a_sensor_tells_of_a_parameter_counts_once_for_all_cameras():
+    """As the formula of a linear update of mean and covariance has it, of what the cameras give without it."""
+    rng = np.random.default_rng(11)
+    seen = RigObservations((seen_by(LEFT, bound(60, 10), rng), seen_by(ASIDE, bound(60, 11), rng)))
+    estimator = RigEstimator(MODEL, [LEFT, ASIDE])
+    images = SequenceFilter(estimator, []).fuse(seen, estimator.fit(seen, TRUTH))
+    own = images.parameter_std[1]
+    told, deviation = images.state.parameters[1] + own, own
+    estimator.known.tell({MODEL.parameters[1].name: (told, deviation)})
+    estimator.known.learn(SIGMA)
+    both = SequenceFilter(estimator, []).fuse(seen, estimator.fit(seen, TRUTH))
+    gain = images.covariance[:, 1] / (own**2 + deviation**2)
+    expected = images.covariance - np.outer(gain, images.covariance[1])
+    np.testing.assert_allclose(both.parameter_std, np.sqrt(np.diag(expected)[:3]), rtol=0.1)
+    step = both.state.parameters - images.state.parameters
+    assert (np.abs(step - gain[:3] * own) < 0.1 * images.parameter_std).all()
+    assert both.parameter_std[1] == pytest.approx(own / np.sqrt(2.0), rel=0.1)
+
+
 def test_prior_of_the_pose_is_in_the_rigs_frame():
     seen = RigObservations((seen_by(ASIDE, bound(60, 9), np.random.default_rng(9)),))
     pose = moved(TRUTH, np.full(9, 0.01)).camera_from_object

@@ -134,13 +134,9 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         f"--refine-camera (refine_camera) estimates {' and '.join(TERM_STD)} here: leave out the other terms",
     ),
     (
-        lambda run: any(part.known is not None for part in run.objects) and (run.live or bool(run.other_cameras)),
-        "a table of known parameters belongs to a recording of one camera: leave out --known or --with; live, your own "
-        "program tells the tracker (Tracker.know)",
-    ),
-    (
-        lambda run: any(part.time_zero is not None for part in run.objects) and bool(run.other_cameras),
-        "the model's time is known by the frames of one camera: leave out --time-zero or --with",
+        lambda run: any(part.known is not None for part in run.objects) and run.live,
+        "a table of known parameters belongs to a recording: leave out --known; live, your own program tells the "
+        "tracker (Tracker.know)",
     ),
     (
         lambda run: run.refine_reference and bool(run.other_cameras),

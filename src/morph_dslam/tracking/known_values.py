@@ -248,6 +248,10 @@ class KnownParameters:
             check_known("known parameters", self.model, k, value, deviation)
         self._set(indices, with_usual_deviations(self.model, indices, values))
 
+    def take(self, other: KnownParameters) -> None:
+        """Know in the present frame what another one does, as a camera of a rig does what is told to the rig."""
+        self.indices, self.now = other.indices, other.now
+
     def _set(self, indices: NDArray[np.int64], values: Array) -> None:
         there = np.isfinite(values[:, 0])
         self.indices, self.now = indices[: len(values)][there], values[there]

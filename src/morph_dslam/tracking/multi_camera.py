@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from morph_dslam.tracking.outcomes import (
     CameraLost,
     CamerasDisagree,
     FoundBy,
+    KnownRefuted,
     ModelDoesNotExplain,
     ObjectMoved,
     PastForgotten,
@@ -152,6 +153,10 @@ class RigTracker:
         """The first one."""
         return self.cameras[0].camera
 
+    def know(self, values: Mapping[str, float | tuple[float, float]]) -> None:
+        """Take in what something else measures of parameters, in the next frames; see `Tracker.know`."""
+        self.estimator.known.tell(values)
+
     def locate(self, frame: Frame) -> CameraLocalization:
         """Find the first camera in the map by its frame; see `Tracker.locate`."""
         return self.trackers[0].locate(frame)
@@ -176,6 +181,7 @@ class RigTracker:
             If a picture or its depth is not of its camera's size, or of another type.
         """
         where = localization or CameraLocalization()
+        self.estimator.known.begin(*_number_and_time(frames))
         known, results = where.pose_prior, self._each(frames, where.pose_prior, occluder_depths)
         has_moved = any(result.warning(ObjectMoved) is not None for result in results)
         prior = None if known is None or has_moved else self._prior(known, results)
@@ -187,7 +193,9 @@ class RigTracker:
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
-        warnings: list[TrackingWarning] = [*_ignored(results, measured), *([ObjectMoved()] if has_moved else [])]
+        warnings: list[TrackingWarning] = [*self.estimator.known.warnings, *_ignored(results, measured)]
+        if has_moved:
+            warnings.append(ObjectMoved())
         if where.why_lost:
             warnings.append(CameraLost(where.why_lost))
         is_hidden = estimate is None and known is not None and not has_moved
@@ -220,6 +228,7 @@ class RigTracker:
         results = []
         time = next((frame.timestamp for frame in frames if isinstance(frame, Frame)), None)
         for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
+            tracker.estimator.known.take(self.estimator.known)
             if frame is None or isinstance(frame, MissingFrame):
                 results.append(tracker.pass_over(time if frame is None else frame.timestamp))
                 continue
@@ -236,7 +245,8 @@ class RigTracker:
         left = self._errors.unexplained(estimate, measured)
         blurred = [tracker.last_blurred for tracker in self.trackers]
         common = [rest.px if p is None else rest.total_px for rest, p in zip(left, blurred, strict=True)]
-        return self._errors.added(estimate, measured, prior, common, blurred), left
+        known = self.estimator.known_information(estimate.state.parameters)
+        return self._errors.added(estimate, measured, prior, common, blurred, known), left
 
     def _found(
         self,
@@ -249,13 +259,15 @@ class RigTracker:
         """A result of the common estimate, in place of the one that would stand without it."""
         used = measured.weights > 0.0
         recovered = all(result.recovered or result.estimate is None for result in results)
+        refuted = _refuted(results)  # what a wrong sensor leaves is no one else's fault
         found = replace(
             lost,
             warnings=(
                 *lost.warnings,
                 *([PastForgotten()] if self._filter.forgot else []),
+                *refuted,
                 *_blurred(results),
-                *_not_explained(results, left),
+                *([] if refuted else _not_explained(results, left)),
             ),
             unexplained_px=max(rest.px for rest in left),
             status=Status.TRACKED,
@@ -264,10 +276,11 @@ class RigTracker:
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
         )
-        errors, nothing = self._model_errors, np.empty(0, dtype=np.int64)
+        errors, known = self._model_errors, self.estimator.known.indices
         if errors is not None:
-            errors = errors.where_known(nothing, found.pose_from.is_of_frame_alone)
-        return with_flat_sides(with_model_errors(found, errors), self._flat_sides)
+            errors = errors.where_known(known, found.pose_from.is_of_frame_alone)
+        held = self._errors.held(known) if len(known) else None
+        return with_flat_sides(with_model_errors(found, errors, held), self._flat_sides)
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""
@@ -288,6 +301,7 @@ class RigTracker:
         if seen is None:
             return None, measured, Rejection(RejectionReason.NO_CAMERA)
         estimate = self.estimator.fit(measured, self.cameras[best].in_rig(seen.state), prior)
+        self.estimator.known.learn(estimate.sigma_px)
         measured = self._agreeing(measured, estimate)
         needed = self.options.least_inliers if prior is None else self.options.least_anchored
         if (measured.weights > 0.0).sum() < needed:
@@ -322,6 +336,23 @@ def _ignored(results: list[FrameResult], measured: RigObservations) -> list[Came
         elif not view.weights.any():
             found.append(CameraIgnored(number, result.status))
     return found
+
+
+def _number_and_time(frames: Sequence[Frame | NDArray[np.uint8] | None]) -> tuple[int | None, float | None]:
+    """Of an instant, by the first camera that has a picture, which by number is that of all, or stands for one."""
+    first = next((frame for frame in frames if isinstance(frame, Frame)), None)
+    return (None, None) if first is None else (first.index, first.timestamp)
+
+
+def _refuted(results: list[FrameResult]) -> list[KnownRefuted]:
+    """The known parameters that the images of a camera alone have elsewhere, by those of the camera that is surest."""
+    found: dict[str, KnownRefuted] = {}
+    for result in results:
+        for warning in result.warnings:
+            if isinstance(warning, KnownRefuted):
+                before = found.setdefault(warning.parameter, warning)
+                found[warning.parameter] = max(before, warning, key=lambda one: one.deviations)
+    return list(found.values())
 
 
 def _blurred(results: list[FrameResult]) -> list[BlurredByMotion]:

@@ -122,30 +122,31 @@ class PlacedObject:
     def new_tracker(self) -> Tracker | RigTracker:
         """A tracker at its beginning; raises RegistrationError if the object shows too few corners."""
         seen = self.seen or (None,) * len(self.cameras)
+        registration, told = self.registration, self.object.known
+        if told is not None and self.in_sequence:
+            registration = registered_with(registration, told, self.frame)
         if len(self.cameras) > 1:
-            return RigTracker(
+            tracker = RigTracker(
                 self.model,
                 self.cameras,
-                self.registration,
+                registration,
                 self.options,
                 references=self.images,
                 in_sequence=self.in_sequence,
                 seen=seen,
                 keyframes=self.keyframes,
             )
-        registration, told = self.registration, self.object.known
-        if told is not None and self.in_sequence:
-            registration = registered_with(registration, told, self.frame)
-        tracker = Tracker(
-            self.model,
-            self.camera,
-            registration,
-            self.options,
-            reference=self.images[0],
-            in_sequence=self.in_sequence,
-            seen=seen[0],
-            keyframes=None if self.keyframes is None else self.keyframes[0],
-        )
+        else:
+            tracker = Tracker(
+                self.model,
+                self.camera,
+                registration,
+                self.options,
+                reference=self.images[0],
+                in_sequence=self.in_sequence,
+                seen=seen[0],
+                keyframes=None if self.keyframes is None else self.keyframes[0],
+            )
         known, zero = tracker.estimator.known, self.object.time_zero
         known.values, known.clock = self.object.known, None if zero is None else KnownTime.of(tracker.model, zero)
         return tracker

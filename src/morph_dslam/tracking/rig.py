@@ -28,6 +28,7 @@ from morph_dslam.tracking.estimator import (
     State,
     pixel_terms,
 )
+from morph_dslam.tracking.known_values import KnownParameters
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.reference import PosedImage
@@ -104,6 +105,15 @@ class RigEstimator:
         self._chains = [part.chain(len(model.parameters)) for part in self.cameras]
 
     @property
+    def known(self) -> KnownParameters:
+        """What something else measures of parameters, which counts once and not once a camera."""
+        return self._single[0].known
+
+    def known_information(self, parameters: Array) -> Array:
+        """What known parameters add to the Hessian (d + 6, d + 6) at parameters (d,)."""
+        return self._single[0].known_information(parameters)[0]
+
+    @property
     def scale(self) -> Array:
         """Of the unknowns (d + 6,), as `Estimator` has it."""
         return self._single[0].scale
@@ -133,7 +143,7 @@ class RigEstimator:
         found = minimise(
             lambda state: self.evaluate(measured, state, prior),
             start,
-            first.box,
+            self.known.bounded(first.box),
             options.max_iterations,
             options.tolerance,
         )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.covariance import held_by
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
@@ -67,6 +68,7 @@ class RigErrors:
             for tracker in trackers
         ]
         self._counts = [len(tracker.reference.points) for tracker in trackers]
+        self._by_known = np.zeros((len(self._scale),) * 2)
 
     def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
         """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
@@ -82,6 +84,7 @@ class RigErrors:
         prior: Prior | None,
         common_px: Sequence[float],
         blurred: Sequence[Array | None] | None = None,
+        known: Array | float = 0.0,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors, and that of motion blur.
 
@@ -93,6 +96,7 @@ class RigErrors:
         common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
         blurred : by camera (p, 2), the paths over which motion smears the points, pixels; None where it does no harm,
             or for all.
+        known : (d + 6, d + 6) what something else that measures parameters adds to the Hessian; 0 where nothing does.
         """
         views = self._views(estimate, measured)
         frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
@@ -100,6 +104,7 @@ class RigErrors:
         hessian = np.sum([view.chain.T @ frame.hessian @ view.chain for view, frame in both], axis=0)
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
+        hessian = hessian + known
         gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
         stated = covariance
         for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
@@ -108,11 +113,16 @@ class RigErrors:
             if paths is not None:
                 moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
                 covariance = covariance + moved @ moved.T
+        self._by_known = gain @ (known + np.zeros_like(hessian))
         if self._is_known:
             pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
             transfer = gain @ np.sum(pushes, axis=0)
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
+
+    def held(self, measured: NDArray[np.int64]) -> Array:
+        """As `SystematicErrors.held`, of the last estimate of all cameras."""
+        return held_by(self._by_known, measured)
 
     def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
         views, first = [], 0

@@ -29,7 +29,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors
+from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors, held_by
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.tracking.reprojection import project_with_jacobian
 
@@ -394,9 +394,7 @@ class SystematicErrors:
 
         ``measured`` : indices of the parameters that they tell.
         """
-        found = np.zeros((len(self._by_known), len(self._by_known) - 6))
-        found[:, measured] = self._by_known[:, measured]
-        return found
+        return held_by(self._by_known, measured)
 
     def deformation_errors(
         self, state: State, of_model: Callable[[Array], tuple[Array, float]] | None
