@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Prior
-from morph_dslam.tracking.measurement import Measurement
+from morph_dslam.tracking.measurement import PATCH_WINDOW, Measurement
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import DepthNotUsed, Rejection, RejectionReason
 from morph_dslam.tracking.outline import OutlineMeasurement
@@ -158,16 +158,18 @@ def reject(hypothesis: PoseHypothesis, options: TrackerOptions) -> Rejection | N
 def _own_spread(hypothesis: PoseHypothesis) -> float:
     """Robust standard deviation of a pixel coordinate of the supporting points, without what neighbours have in common.
 
-    It is that of the difference between a point and the one nearest to it, over the root of two.
+    It is that of the difference between a point and the nearest one whose window does not overlap its own, over the
+    root of two: overlapping windows show the same texture, and err alike wherever it was found.
     """
     rows = hypothesis.inliers
     pixels, residuals = hypothesis.measurement.pixels[rows], hypothesis.estimate.residuals[: len(rows)][rows]
-    if len(pixels) < 2:
+    apart = np.abs(pixels[:, None] - pixels).max(axis=2) >= PATCH_WINDOW
+    squared = np.where(apart, np.sum((pixels[:, None] - pixels) ** 2, axis=2), np.inf)
+    has_one = apart.any(axis=1)
+    if not has_one.any():
         return hypothesis.estimate.sigma_px
-    squared = np.sum((pixels[:, None] - pixels) ** 2, axis=2)
-    np.fill_diagonal(squared, np.inf)
-    apart = np.median(np.abs(residuals - residuals[squared.argmin(axis=1)]))
-    return float(apart / MEDIAN_OF_NUMBER / np.sqrt(2.0))
+    differences = (residuals - residuals[squared.argmin(axis=1)])[has_one]
+    return float(np.median(np.abs(differences)) / MEDIAN_OF_NUMBER / np.sqrt(2.0))
 
 
 def _reject_outline(hypothesis: PoseHypothesis, visible: int, count: int) -> Rejection | None:
