@@ -44,8 +44,8 @@ class RunWarning(StrEnum):
 
     LOST = "{count} of {n_frames} frames {were} lost; their reasons are in frames.csv"
     HIDDEN = (
-        "the object was hidden in {count} of {n_frames} frames: its pose there is the map's, its parameters are not "
-        "known"
+        "the object was hidden in {count} of {n_frames} frames: its pose there is the map's, as if nobody had moved or "
+        "taken it, and its parameters are not known"
     )
     BY_OUTLINE = (
         "the object was followed by its outline alone in {count} of {n_frames} frames: what moves along the outline, "
