@@ -4,11 +4,25 @@ import numpy as np
 import pytest
 
 import morph_dslam as md
+from morph_dslam.camera import Camera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.io.camera_files import save_rig
+from morph_dslam.tracking.rig import RigCamera
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import samples
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state, write_landmarks, write_recording
 
 STEP = 0.02
+
+
+#: Half a metre apart and turned towards each other.
+RIG = (
+    RigCamera(Camera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity()),
+    RigCamera(
+        Camera(480, 360, 350.0, 350.0, 235.0, 182.0),
+        RigidTransform(rotation_exp(np.array([0.0, 0.5, 0.0])), np.array([-0.297, 0.0, 0.076])),
+    ),
+)
 
 
 def hand(column):
@@ -21,15 +35,28 @@ def hand(column):
 def page(tmp_path_factory):
     """What the samples leave: their names, and the true state of the picture that each of them saw last."""
     folder, model = tmp_path_factory.mktemp("own"), bent_sheet_model(22, 16)
-    film, taken, last = SheetFilm(model), [], {}
+    film, taken, both, last = SheetFilm(model), [], [], {}
 
     def grab(rgb=False):
         taken.append(sheet_state(STEP * len(taken)))
         return film.frame(taken[-1])[:, :, :: -1 if rgb else 1].copy()
 
-    names = {"grab": grab, "segment": lambda _: hand(300), "first_picture": film.frame(sheet_state(0.0))}
+    rig_films = [SheetFilm(model, part.camera) for part in RIG]
+
+    def grab_all():
+        both.append(sheet_state(STEP * len(both)))
+        return [shown.frame(part.seen(both[-1]), noise=6.0) for shown, part in zip(rig_films, RIG, strict=True)]
+
+    names = {"grab_all": grab_all} | {
+        "grab": grab,
+        "segment": lambda _: hand(300),
+        "first_picture": film.frame(sheet_state(0.0)),
+    }
     write_recording(folder, {}, model)
     write_landmarks(folder / "landmarks.csv", model, sheet_state(0.0))
+    for number, part in enumerate(RIG):
+        write_landmarks(folder / f"landmarks_{number}.csv", model, part.seen(sheet_state(0.0)), part.camera, count=24)
+    save_rig(folder / "camchain.yaml", [(part.camera, part.camera_from_rig) for part in RIG])
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for number, program in enumerate(samples("own-program", "python")):
@@ -59,6 +86,18 @@ def test_the_other_samples_do_what_the_page_says(page):
     assert all(result.tracked for each in names["found"] for result in each.results.values())
     assert sorted(path.name for path in (folder / "states").glob("*.vtu"))[-1].endswith("_0004.vtu")
     np.testing.assert_allclose(names["state"].parameters, [0.020, 0.3, 0.0])
+
+
+def test_a_rig_finds_the_state_that_both_cameras_saw(page):
+    """By landmarks and pictures of both; each frame's truth is what it was rendered in."""
+    _, names, _ = page
+    truth, found = sheet_state(STEP), names["together"]
+    assert found.tracked
+    assert not found.warnings
+    away = found.estimate.state.parameters - truth.parameters
+    assert (np.abs(away) < 4.0 * found.estimate.parameter_std).all()
+    exact = truth.camera_from_object.apply(names["model"].positions(truth.parameters))
+    assert np.linalg.norm(found.positions() - exact, axis=1).mean() < 0.5e-3
 
 
 AS_DEPTH = {

@@ -370,7 +370,7 @@ def test_every_program_is_run_by_a_test():
         "materials": 1,
         "meshes": 1,
         "model-file": 2,
-        "own-program": 11,
+        "own-program": 12,
         "record-your-own": 1,
         "run-folder": 1,
         "scene-file": 1,

@@ -53,6 +53,15 @@ def test_there_are_few_public_names():
 EXTEND = sorted(path.stem for path in Path(extend.__file__).parent.glob("[a-z]*.py"))
 
 
+def test_a_path_may_be_a_string_wherever_a_path_is_taken():
+    modules = [md, *(importlib.import_module(f"morph_dslam.extend.{name}") for name in EXTEND)]
+    functions = [f for module in modules for f in map(module.__dict__.get, dir(module)) if inspect.isfunction(f)]
+    assert len(functions) > 50
+    for function in functions:
+        for name, parameter in inspect.signature(function).parameters.items():
+            assert parameter.annotation not in ("Path", "Path | None"), f"{function.__name__}({name})"
+
+
 @pytest.mark.parametrize("name", EXTEND)
 def test_building_blocks_are_listed_and_documented(name):
     module = importlib.import_module(f"morph_dslam.extend.{name}")

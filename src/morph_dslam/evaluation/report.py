@@ -148,7 +148,8 @@ def _row(cells: Sequence[str], tag: str) -> str:
     return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
 
 
-def write_report(path: Path, title: str, sections: Sequence[Section]) -> None:
+def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> None:
     """Write a self-contained HTML page; sections without blocks are left out."""
+    path = Path(path)
     body = "\n".join(section.html() for section in sections if section.blocks)
     path.write_text(_PAGE.substitute(title=escape(title), body=body), encoding="utf-8")

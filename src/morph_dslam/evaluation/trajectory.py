@@ -273,8 +273,9 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     return figures
 
 
-def trajectory_evaluation_files(run: Path) -> tuple[Path, Path]:
+def trajectory_evaluation_files(run: str | Path) -> tuple[Path, Path]:
     """Figures and picture that `evaluate_trajectory` writes for a run folder or a trajectory file."""
+    run = Path(run)
     path = _trajectory_file(run)
     return path.with_name(f"{path.stem}_evaluation.json"), path.with_name(f"{path.stem}_evaluation.png")
 

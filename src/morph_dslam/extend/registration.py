@@ -1,5 +1,6 @@
 """Registration from files to files, landmarks, and other ways to find an object in a frame."""
 
+from morph_dslam.io.camera_files import load_rig as load_rig
 from morph_dslam.io.landmarks import (
     Landmarks as Landmarks,
     load_landmarks as load_landmarks,

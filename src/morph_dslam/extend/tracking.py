@@ -20,6 +20,7 @@ from morph_dslam.tracking.estimator import (
 )
 from morph_dslam.tracking.found_inputs import FoundInputs as FoundInputs, find_inputs as find_inputs
 from morph_dslam.tracking.load_prior import LoadOptions as LoadOptions
+from morph_dslam.tracking.multi_camera import RigTracker as RigTracker
 from morph_dslam.tracking.reactions import (
     Reaction as Reaction,
     Reactions as Reactions,

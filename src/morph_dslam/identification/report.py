@@ -298,13 +298,15 @@ def last_line(figures: Mapping[str, Any]) -> str:
 RESULT = "identification.json"
 
 
-def check_no_identification(folder: Path, overwrite: bool) -> None:
+def check_no_identification(folder: str | Path, overwrite: bool) -> None:
     """Raise IdentificationError if a folder holds an identification that is not to be overwritten."""
+    folder = Path(folder)
     check_free(folder / RESULT, "an identification", overwrite, IdentificationError)
 
 
-def write_identification(folder: Path, found: Identification) -> dict[str, Any]:
+def write_identification(folder: str | Path, found: Identification) -> dict[str, Any]:
     """Write ``identification.json`` and ``identification.png``; returns the figures."""
+    folder = Path(folder)
     figures = summarise(found)
     with writing(IdentificationError, folder):
         folder.mkdir(parents=True, exist_ok=True)

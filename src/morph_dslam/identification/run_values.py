@@ -18,7 +18,9 @@ from morph_dslam.model import Parameter
 Array = NDArray[np.float64]
 
 
-def values_of_run(folder: Path, run: Run, names: Collection[str], measured: bool) -> tuple[KnownValues, list[str]]:
+def values_of_run(
+    folder: str | Path, run: Run, names: Collection[str], measured: bool
+) -> tuple[KnownValues, list[str]]:
     """What a run found of the parameters to identify, and notes on what does not count.
 
     Parameters
@@ -34,6 +36,7 @@ def values_of_run(folder: Path, run: Run, names: Collection[str], measured: bool
         If nothing else was measured, and the run found a parameter at an end of its range, or frames of it contradict
         each other in one.
     """
+    folder = Path(folder)
     found = json.loads((folder / "summary.json").read_text())["one_over_the_sequence"]
     of_model = {parameter.name: parameter for parameter in run.model.parameters}
     apart = [each["name"] for each in found if each["name"] in names and not each.get("is_one_value", True)]

@@ -156,8 +156,9 @@ def parse_camera(content: object, where: str) -> Camera:
     return camera
 
 
-def save_camera(path: Path, camera: Camera) -> None:
+def save_camera(path: str | Path, camera: Camera) -> None:
     """Write a camera file that `load_camera` reads."""
+    path = Path(path)
     content = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     content["distortion"] = list(camera.distortion)
     if camera.distortion:

@@ -42,11 +42,12 @@ _HEAD = 4096
 _STL_HEADER, _STL_TRIANGLE = 80, 50
 
 
-def file_kind(path: Path) -> str:
+def file_kind(path: str | Path) -> str:
     """The ending that fits what is in a file, in small letters: ".png", ".stl"; one of several for the same.
 
     By its name where the content does not tell, or there is no file that can be read.
     """
+    path = Path(path)
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)

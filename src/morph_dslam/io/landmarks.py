@@ -57,12 +57,13 @@ class Landmarks:
             object.__setattr__(self, "frames", np.asarray(self.frames, dtype=np.int64))
 
 
-def load_landmarks(path: Path) -> Landmarks:
+def load_landmarks(path: str | Path) -> Landmarks:
     """Read a landmark file.
 
     Raises RegistrationError if the file is missing, has another header, or a value is no number, or one that cannot be
     meant.
     """
+    path = Path(path)
     rows = [cells for _, cells in read_csv(path, "landmarks", RegistrationError)]
     header = tuple(rows[0]) if rows else ()
     if header not in (HEADER, (FRAME, *HEADER)):
@@ -87,8 +88,9 @@ def _values(path: Path, number: int, row: list[str], header: tuple[str, ...]) ->
     return values
 
 
-def save_landmarks(path: Path, landmarks: Landmarks) -> None:
+def save_landmarks(path: str | Path, landmarks: Landmarks) -> None:
     """Write a landmark file that `load_landmarks` reads."""
+    path = Path(path)
     lines = [
         ",".join([*(f"{1e3 * x:.6g}" for x in point), *(f"{x:.4f}" for x in pixel)])
         for point, pixel in zip(landmarks.points, landmarks.pixels, strict=True)

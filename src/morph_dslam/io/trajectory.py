@@ -67,7 +67,7 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
 
-def load_trajectory(path: Path) -> Trajectory:
+def load_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory.
 
     Parameters
@@ -80,6 +80,7 @@ def load_trajectory(path: Path) -> Trajectory:
     Raises TrajectoryError if it is missing, empty, or of none of these kinds, a line is no pose, or EuRoC's camera is
     not found, and CameraError if it does not say where it is on the body.
     """
+    path = Path(path)
     path = Path(path)
     if path.is_dir():
         return _make(path, _seven_scenes_rows(path))

@@ -33,12 +33,15 @@ _WIDE = 0.1
 _MEGAPASCAL = 1e6
 
 
-def check_no_fit(folder: Path, overwrite: bool) -> None:
+def check_no_fit(folder: str | Path, overwrite: bool) -> None:
     """Raise IdentificationError if a folder holds a fit that is not to be overwritten."""
+    folder = Path(folder)
     check_free(folder / RESULT, "a fit", overwrite, IdentificationError)
 
 
-def write_fit(folder: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest], name: str) -> dict[str, Any]:
+def write_fit(
+    folder: str | Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest], name: str
+) -> dict[str, Any]:
     """Write ``fit.json``, ``material.toml`` with the recommended law, and ``fit.png``; returns the figures.
 
     Parameters
@@ -53,6 +56,7 @@ def write_fit(folder: Path, fitted: Sequence[FittedLaw], tests: Sequence[Materia
     IdentificationError
         If a file cannot be written.
     """
+    folder = Path(folder)
     figures = summarise(fitted, tests)
     with writing(IdentificationError, folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -72,7 +72,7 @@ def _volume(corners: Array) -> float:
     return float(np.einsum("ti,ti->", about[:, 0], np.cross(about[:, 1], about[:, 2]))) / 6.0
 
 
-def file_notes(mesh: Mesh, path: Path, unit: str, size: float | None = None) -> list[str]:
+def file_notes(mesh: Mesh, path: str | Path, unit: str, size: float | None = None) -> list[str]:
     """Sentences on the mesh of a file; none where there is nothing to say.
 
     Parameters
@@ -82,6 +82,7 @@ def file_notes(mesh: Mesh, path: Path, unit: str, size: float | None = None) -> 
     unit : of its coordinates.
     size : longest edge of a cell where its volume was meshed, metres; None if its triangles were kept.
     """
+    path = Path(path)
     notes = []
     if not mesh.is_sheet and file_kind(path) in SURFACES:
         notes += _surface_notes(mesh, path, to_si(1.0, unit, "length"), size)

@@ -95,8 +95,9 @@ class InnerStructure:
         return CarriedStructure(self.name, self.triangles, self.rest, model.restrict(self.points))
 
 
-def save_inner_structure(path: Path, structure: InnerStructure) -> None:
+def save_inner_structure(path: str | Path, structure: InnerStructure) -> None:
     """Write a file that `load_inner_structure` reads."""
+    path = Path(path)
     try:
         with written_hdf5(path) as file:
             file.attrs.update({"format": FORMAT, "version": VERSION, "name": structure.name})

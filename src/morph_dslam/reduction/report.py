@@ -24,8 +24,9 @@ from morph_dslam.studies.build import build_warnings
 _Part = tuple[str, list[Callable[[], Block]]]
 
 
-def report_path(model_file: Path) -> Path:
+def report_path(model_file: str | Path) -> Path:
     """Where the report of a model file is: "seal.report.html" beside "seal.morph"."""
+    model_file = Path(model_file)
     return model_file.with_name(f"{model_file.name.removesuffix('.morph')}.report.html")
 
 

@@ -209,7 +209,7 @@ class ReferenceCurve:
     mean_mm: Array
 
 
-def read_reference_curve(path: Path) -> ReferenceCurve:
+def read_reference_curve(path: str | Path) -> ReferenceCurve:
     """Read a CSV file of two columns: numbers of modes, and mean errors in mm under the curve's label.
 
     Raises
@@ -217,6 +217,7 @@ def read_reference_curve(path: Path) -> ReferenceCurve:
     StudyError
         If there is no such file, or it does not hold numbers in two columns under a line of titles.
     """
+    path = Path(path)
     form = 'a line of titles, "modes,the paper" for example, and lines "3,0.935", the error in mm'
     if not path.is_file():
         raise StudyError(f"there is no reference curve {path}: it needs {form}")

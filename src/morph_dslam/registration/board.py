@@ -274,8 +274,9 @@ class FiducialBoard:
         return image
 
 
-def load_board(path: Path) -> FiducialBoard:
+def load_board(path: str | Path) -> FiducialBoard:
     """Read a board file."""
+    path = Path(path)
     description = read_sections(path, "board file", BoardFile, RegistrationError)
     board = FiducialBoard(description)
     try:
@@ -288,8 +289,9 @@ def load_board(path: Path) -> FiducialBoard:
     return board
 
 
-def print_board(board: FiducialBoard, path: Path) -> None:
+def print_board(board: FiducialBoard, path: str | Path) -> None:
     """Write the board in its true size as a PNG or PDF file, with a white margin and a line to measure."""
+    path = Path(path)
     from matplotlib.figure import Figure
 
     inch, margin = 0.0254, 0.015

@@ -254,17 +254,17 @@ def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[KeyframeP
 
 
 def run_registration(
-    map_path: Path,
-    model_path: Path,
-    camera_path: Path,
-    output: Path,
+    map_path: str | Path,
+    model_path: str | Path,
+    camera_path: str | Path,
+    output: str | Path,
     beside: Sequence[Path] = (),
-    board: Path | None = None,
+    board: str | Path | None = None,
     *,
-    landmarks: Path | None = None,
+    landmarks: str | Path | None = None,
     distance: float | None = None,
     region: tuple[int, tuple[float, float, float, float]] | None = None,
-    guess: Path | None = None,
+    guess: str | Path | None = None,
     overwrite: bool = False,
 ) -> Registration:
     """Register an object from files to files: ``registration.json``, and ``registration.jpg`` without a board.
@@ -288,6 +288,10 @@ def run_registration(
     MapError, ModelFileError, CameraError
         If an input cannot be read.
     """
+    map_path, model_path, camera_path, output = Path(map_path), Path(model_path), Path(camera_path), Path(output)
+    board = None if board is None else Path(board)
+    landmarks = None if landmarks is None else Path(landmarks)
+    guess = None if guess is None else Path(guess)
     hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region, "guess": guess}
     if board is not None and (beside or any(hint is not None for hint in hints.values())):
         raise RegistrationError("a board says where the object is: leave out --beside and the hints")

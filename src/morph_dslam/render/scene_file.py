@@ -233,7 +233,7 @@ class Scene(Section):
         return self
 
 
-def load_scene_file(path: Path) -> Scene:
+def load_scene_file(path: str | Path) -> Scene:
     """Read and check a scene file.
 
     Raises
@@ -241,4 +241,5 @@ def load_scene_file(path: Path) -> Scene:
     SceneError
         If the file is missing, is not TOML, or a key is unknown, missing or has an impossible value.
     """
+    path = Path(path)
     return read_sections(path, "scene file", Scene, SceneError)

@@ -54,7 +54,7 @@ def supersampled(camera: Camera, factor: int) -> Camera:
     )
 
 
-def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre: float) -> Image:
+def print_texture(surface: Surface, folder: str | Path, size: Array, pixels_per_metre: float) -> Image:
     """The sheet's print, with its border, at the resolution at which the camera sees it.
 
     Parameters
@@ -63,6 +63,7 @@ def print_texture(surface: Surface, folder: Path, size: Array, pixels_per_metre:
     pixels_per_metre : of the image, where the sheet is seen face on; less is taken where the longer side would have
         more than `LARGEST_PRINT` pixels.
     """
+    folder = Path(folder)
     photograph = load_photograph(surface.texture, folder)
     pixels_per_metre = min(pixels_per_metre, LARGEST_PRINT / float(size.max()))
     width, height = np.maximum(np.rint(size * pixels_per_metre).astype(int), 2)

@@ -66,15 +66,15 @@ class _Start:
 
 def run_slam(
     source: str | Path,
-    camera: Path,
-    output: Path,
+    camera: str | Path,
+    output: str | Path,
     first: int | None = None,
     last: int | None = None,
     *,
     options: SlamOptions | None = None,
-    map_path: Path | None = None,
-    trajectory: Path | None = None,
-    images: Path | None = None,
+    map_path: str | Path | None = None,
+    trajectory: str | Path | None = None,
+    images: str | Path | None = None,
     refine: Sequence[CameraTerm] = (),
     depth_per_metre: float | None = None,
     fps: float | None = None,
@@ -112,6 +112,10 @@ def run_slam(
     Raises MorphError if an input cannot be used (CameraError, SourceError, MapError) or the run folder holds a run
     (TrackingError).
     """
+    camera, output = Path(camera), Path(output)
+    map_path = None if map_path is None else Path(map_path)
+    trajectory = None if trajectory is None else Path(trajectory)
+    images = None if images is None else Path(images)
     options, start = options or SlamOptions(), _Start(map_path, trajectory, images)
     start.check(options, refine)
     one_or_two = load_camera_or_pair(camera)

@@ -52,8 +52,9 @@ def place_inner_structure(model: ReducedModel, name: str, nodes: Array, triangle
     return InnerStructure(name, rest, triangles.astype(np.int64), points)
 
 
-def read_inner_structure(model: ReducedModel, name: str, path: Path, unit: str) -> InnerStructure:
+def read_inner_structure(model: ReducedModel, name: str, path: str | Path, unit: str) -> InnerStructure:
     """The same from a surface file (.stl, .obj, .ply) drawn in ``unit`` in the object frame."""
+    path = Path(path)
     surface = read_surface(path)
     return place_inner_structure(model, name, to_si(1.0, unit, "length") * surface.points, surface.triangles)
 

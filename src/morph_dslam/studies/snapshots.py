@@ -41,8 +41,9 @@ def snapshot_keys(fingerprint: str, samples: Iterable[Array]) -> list[str]:
     return [hashlib.sha256(text.encode()).hexdigest()[:24] for text in texts]
 
 
-def save_snapshot(path: Path, snapshot: Snapshot, state: dict[str, Array]) -> None:
+def save_snapshot(path: str | Path, snapshot: Snapshot, state: dict[str, Array]) -> None:
     """Write a snapshot and the arrays of the solver's state; the file appears only when it is complete."""
+    path = Path(path)
     write_atomically(path, encode_snapshot(snapshot, state))
 
 
@@ -96,11 +97,12 @@ def _hides_members(archive: zipfile.ZipFile) -> bool:
     return bool(np.any(between < 0) or np.any(between > ZIP_EXTRA))
 
 
-def load_snapshot(path: Path) -> Snapshot:
+def load_snapshot(path: str | Path) -> Snapshot:
     """What `save_snapshot` wrote; fields, in single precision, are read each time they are asked for.
 
     So a thousand snapshots take no memory, and whoever gathers one field of them needs no more than that.
     """
+    path = Path(path)
     with np.load(path) as file:
         stored = [StoredArrays(path, file.files, prefix) for prefix in ("field", "slope")]
         return Snapshot(file["coordinates"], *stored, _under(file, "output"))  # type: ignore[arg-type]

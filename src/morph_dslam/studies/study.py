@@ -69,7 +69,7 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
         raise StudyError(f"{where}: {explain(kind, error, content)}") from error
 
 
-def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
+def mesh_of_file(path: str | Path, unit: str, size: float | None = None) -> Mesh:
     """The mesh of a study file with the sets that it makes, whichever it names, or of a mesh file.
 
     Raises StudyError as `load_study` and `load_mesh`, or if a study has no mesh.
@@ -80,6 +80,7 @@ def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
     unit : of a mesh file's coordinates.
     size : longest edge of a cell in that unit, where Netgen meshes a mesh file's volume.
     """
+    path = Path(path)
     if path.suffix != ".toml":
         return load_mesh(path, unit, None if size is None else to_si(size, unit, "length"))
     study = load_study(path)
@@ -90,7 +91,7 @@ def mesh_of_file(path: Path, unit: str, size: float | None = None) -> Mesh:
     raise StudyError(f"{path} has no [mesh]: sheets in grips and solutions of other programs have no sets to name")
 
 
-def mesh_notes(path: Path, unit: str, size: float | None, mesh: Mesh) -> list[str]:
+def mesh_notes(path: str | Path, unit: str, size: float | None, mesh: Mesh) -> list[str]:
     """Sentences on the ``mesh`` that `mesh_of_file` has made: how far it is from its file, what was mended.
 
     Parameters
@@ -98,6 +99,7 @@ def mesh_notes(path: Path, unit: str, size: float | None, mesh: Mesh) -> list[st
     path, unit, size : those of `mesh_of_file`.
     mesh : the result.
     """
+    path = Path(path)
     if path.suffix != ".toml":
         return file_notes(mesh, path, unit, None if size is None else to_si(size, unit, "length"))
     study = load_study(path)

@@ -123,7 +123,7 @@ class SweepResult:
     failed: dict[int, str] = field(default_factory=dict)
 
 
-def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Executor) -> SweepResult:
+def run_sweep(study: ParametricStudy, samples: Array, folder: str | Path, executor: Executor) -> SweepResult:
     """Solve all ``samples`` (n, d), canonical, keeping each as soon as it is solved.
 
     Samples found in ``folder`` are not solved again, so that a caller can come back with more of them; a
@@ -138,6 +138,7 @@ def run_sweep(study: ParametricStudy, samples: Array, folder: Path, executor: Ex
     WorkerError
         If the executor's workers are lost or do not fit.
     """
+    folder = Path(folder)
     with writing(StudyError, folder):
         folder.mkdir(parents=True, exist_ok=True)
     fingerprint = study.fingerprint()

@@ -87,12 +87,13 @@ class FoundInputs:
         return paths[0]
 
 
-def find_inputs(folder: Path) -> FoundInputs:
+def find_inputs(folder: str | Path) -> FoundInputs:
     """What a folder holds of a run's inputs.
 
     Files are known by their keys, columns and first bytes; of folders below it only recordings, and what
     `morph register` writes, count.
     """
+    folder = Path(folder)
     described = {path: _keys(path, tomllib.loads) for path in _files(folder, ".toml")}
     studies = tuple(path for path, keys in described.items() if _OF_A_STUDY & keys)
     places = [*_files(folder, ".json"), *sorted(folder.glob("*/registration.json"))]
