@@ -255,6 +255,22 @@ def test_a_recording_is_tracked_from_its_first_frame(recording, tmp_path):
     assert found.parameters[:, 0] == pytest.approx(truth["parameters"][:9, 0], abs=1e-3)
 
 
+@pytest.mark.parametrize("pose", ["map", "free"])
+def test_another_recording_than_the_scans_is_tracked_whole(recording, tmp_path, pose):
+    """The number of the map's keyframe, which this one is too short to have, says nothing about its frames."""
+    folder, truth = recording
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number, name in enumerate(sorted((folder / "sequence" / "frames").iterdir())[40:46]):
+        (frames / f"{number:04d}{name.suffix}").write_bytes(name.read_bytes())
+    known = {"frames": frames, "first": None, "video": False, "tracker": md.TrackerOptions(pose=pose)}
+    summary = md.track(replace(options(folder, tmp_path / "run"), **known))
+    assert summary["n_frames"] == summary["n_tracked"] == 6
+    found = load_run(tmp_path / "run")
+    assert found.frames.tolist() == list(range(6))
+    assert found.parameters[:, 0] == pytest.approx(truth["parameters"][40:46, 0], abs=1e-3)
+
+
 def test_a_live_run_keeps_the_pace_and_everything_it_found(recording, tmp_path):
     folder, truth = recording
     summary = md.track(options(folder, tmp_path / "live", first=30, live=True, serve=0))

@@ -149,9 +149,11 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
 def _with_first_frame(run: TrackOptions, objects: Sequence[TrackedObject]) -> TrackOptions:
     """Without a map, a recording is tracked from the frame that an object is registered in, if nothing else is asked.
 
-    In a map an object is found in any frame, so all are tracked: the frame registered is the last one of the scan.
+    A map's keyframe is a frame of the scan, which may be another recording, and it shows the object to whatever pose is
+    tracked by. So all frames are tracked, and the object is searched for in the first one.
     """
-    frames = [part.start.frame for part in objects if isinstance(part.start, Registration) and part.scene is None]
+    starts = [part.start for part in objects if isinstance(part.start, Registration)]
+    frames = [start.frame for start in starts if start.scene is None]
     return run if run.live or run.first is not None or not frames else replace(run, first=frames[0])
 
 
