@@ -6,7 +6,7 @@ import pytest
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
-from morph_dslam.registration.messages import DepthAgainstLandmarks, PoorFit
+from morph_dslam.registration.messages import DepthAgainstLandmarks, DepthBehindObject, PoorFit
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, mean_error, sheet_depth
@@ -17,17 +17,25 @@ POSE = RigidTransform(rotation_exp(np.array([0.1, 0.7, 0.0])) @ UPRIGHT, np.arra
 BENT = State(np.array([0.04, 0.2, 0.1]), POSE)
 
 
-def registered(seed, shift_px, landmark_px=0.5):
-    """Sixteen landmarks, and a depth image whose columns are shifted."""
+#: What lies behind the sheet, and what is before it where something is, metres.
+BEHIND, BEFORE = 1.5, 0.4
+
+
+def registered(seed, shift_px, landmark_px=0.5, count=16, covered=0.0):
+    """Landmarks, and a depth image whose columns are shifted, with something before this share of its width."""
     rng = np.random.default_rng(seed)
-    rows = rng.choice(len(MODEL.nodes), 16, replace=False)
+    rows = rng.choice(len(MODEL.nodes), count, replace=False)
     pixels = CAMERA.project(POSE.apply(MODEL.positions(BENT.parameters)[rows]))
     landmarks = Landmarks(MODEL.nodes[rows], pixels + landmark_px * rng.standard_normal(pixels.shape))
-    return register_landmarks(MODEL, CAMERA, landmarks, depth=np.roll(sheet_depth(MODEL, BENT, rng), shift_px, axis=1))
+    depth = np.roll(sheet_depth(MODEL, BENT, rng, background=BEHIND), shift_px, axis=1)
+    left, right = np.flatnonzero((depth < 0.5 * BEHIND).any(axis=0))[[0, -1]]
+    depth[:, left : left + int(covered * (right - left))] = BEFORE
+    return register_landmarks(MODEL, CAMERA, landmarks, depth=depth)
 
 
 def kinds(registration):
-    return {type(warning) for warning in registration.warnings} & {DepthAgainstLandmarks, PoorFit}
+    named = {DepthAgainstLandmarks, DepthBehindObject, PoorFit}
+    return {type(warning) for warning in registration.warnings} & named
 
 
 def test_depth_that_is_shifted_is_named_and_not_the_landmarks():
@@ -51,3 +59,24 @@ def test_depth_that_is_aligned_is_not_named(seed):
 
 def test_landmarks_that_do_not_fit_alone_are_named_themselves():
     assert kinds(registered(1, 0, landmark_px=3.0)) == {PoorFit}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_depth_that_many_landmarks_take_up_is_named_by_what_it_sees_through(seed):
+    """They fit nearly as well with it, millimetres off; but beside its image of the sheet it sees what is behind."""
+    shift_px = 12
+    found = registered(seed, shift_px, count=40)
+    assert kinds(found) == {DepthBehindObject}
+    assert mean_error(MODEL, found.state, BENT) > 3e-3
+    (said,) = (w for w in found.warnings if isinstance(w, DepthBehindObject))
+    sheet = sheet_depth(MODEL, BENT, np.random.default_rng(0), background=BEHIND) < 0.5 * BEHIND
+    bared = sheet & ~np.roll(sheet, shift_px, axis=1)
+    # But for what is near the rim, or at the jump, where there is no depth.
+    assert said.percent == pytest.approx(100.0 * bared.sum() / sheet.sum(), rel=0.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_before_the_object_is_not_taken_for_depth_that_is_shifted(seed):
+    found = registered(seed, 0, covered=0.3)
+    assert kinds(found) == set()
+    assert mean_error(MODEL, found.state, BENT) < 1e-3

@@ -29,6 +29,7 @@ from morph_dslam.registration.messages import (
     Ambiguous,
     AtBound,
     DepthAgainstLandmarks,
+    DepthBehindObject,
     FewLandmarks,
     NotAtRest,
     PoorFit,
@@ -44,7 +45,7 @@ from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SIGMA_AT_1M
-from morph_dslam.tracking.depth_registration import refine_by_depth
+from morph_dslam.tracking.depth_registration import refine_by_depth, share_behind
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.rig import RigCamera
 
@@ -55,6 +56,8 @@ CLICK_PX = 0.5
 UNKNOWN_PX = 2.0
 #: With fewer numbers to spare, residuals show the error of landmarks to a third at best.
 ENOUGH_SPARE = 6
+#: More of the depths on an object than this share do not lie behind it, if they belong to its pixels.
+SEEN_THROUGH = 0.05
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
 
@@ -152,6 +155,7 @@ class _Placed:
     notes : on what corrected it.
     facts : on that too.
     is_corrected : whether something beside landmarks decided.
+    behind : share of the depths on it that lie behind it.
     """
 
     estimate: Estimate
@@ -161,6 +165,7 @@ class _Placed:
     notes: tuple[RegistrationWarning, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
     is_corrected: bool = False
+    behind: float = 0.0
 
 
 def _precise(fit: LandmarkFit) -> Estimator:
@@ -177,9 +182,11 @@ def _by_depth(
     # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
     sigma = max(fit.best.sigma_px, LEAST_PX) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
     landmarks = fit.landmarks
-    best = refine_by_depth(_precise(fit), landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, depth_sigma)
+    precise = _precise(fit)
+    best = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, depth_sigma)
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
-    return _Placed(best, covariance, None, alternatives, facts={"along_the_sight_line": "by depth"}, is_corrected=True)
+    facts, behind = {"along_the_sight_line": "by depth"}, share_behind(precise, best.state, depth, depth_sigma)
+    return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind)
 
 
 def _by_outline(fit: LandmarkFit, placed: _Placed, grey: NDArray[np.uint8]) -> _Placed:
@@ -232,6 +239,9 @@ def _warnings(
     fits = _of_residuals(fit, best, moved, is_by_depth)
     if fits is not None and not (isinstance(fits, PoorFit) and contradiction is not None):
         found.append(fits)
+    # Landmarks take up most of a depth that is shifted: that they fit says little.
+    if placed.behind > SEEN_THROUGH and not isinstance(fits, DepthAgainstLandmarks):
+        found.append(DepthBehindObject(100.0 * placed.behind))
     size = extent(model.nodes)
     if not SIZES[0] < size < SIZES[1]:
         found.append(UnusualSize(size))

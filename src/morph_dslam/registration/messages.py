@@ -141,6 +141,23 @@ class DepthAgainstLandmarks(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class DepthBehindObject(RegistrationWarning):
+    """The depth camera sees through the object.
+
+    Attributes
+    ----------
+    percent : of the depths measured where the object is seen, those that lie clearly behind it.
+    """
+
+    template: ClassVar[str] = (
+        "the depth image sees through the object: {percent:.0f} % of what it measured there lies behind it. Depth is "
+        "not aligned to the colour image, or of another instant: align it, or track without --depth; until then places "
+        "are off by more than stated. If it is aligned, the mesh covers an opening, or landmarks are wrong"
+    )
+    percent: float
+
+
+@dataclass(frozen=True)
 class CamerasContradict(RegistrationWarning):
     """The landmarks of a rig's cameras do not go together with how these stand to each other.
 

@@ -122,6 +122,24 @@ class _DepthFit:
         return np.concatenate([away.ravel(), self._term.residuals(self._estimator.camera, self._at(step))])
 
 
+def share_behind(
+    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float = SIGMA_AT_1M
+) -> float:
+    """Share of the depths measured where the object is seen that lie clearly behind it; 0 where there are too few.
+
+    No depth that belongs to these pixels does: the object is in the way. What stands before it is not counted. Nor is
+    the object's rim (`RIM_PX`), where depth and colour of aligned cameras may be some pixels apart.
+
+    Parameters
+    ----------
+    state : of the object, as registered with this image.
+    image : (h, w) as recorded, metres, NaN where unknown.
+    """
+    points, _, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m)
+    behind = (measured.weights > 0.0) & ~near & (measured.depths > points.in_camera(state)[:, 2])
+    return float(behind.sum() / measured.count) if measured.count >= LEAST else 0.0
+
+
 def depth_term(
     estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float = SIGMA_AT_1M
 ) -> DepthTerm:
