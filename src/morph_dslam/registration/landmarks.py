@@ -139,6 +139,7 @@ def register_landmarks(
         facts=facts,
         warnings=tuple(warnings),
         alternatives=placed.alternatives,
+        by_depth=depth is not None,
     )
 
 

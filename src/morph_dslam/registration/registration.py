@@ -213,6 +213,7 @@ class Registration:
     scene : whose map it is registered in; None where there is none, or only its file is known.
     alternatives : other states that what it was registered by does not exclude, where they are known.
     rivals : other places in the map, the best first.
+    by_depth : whether depth images say how far away it is, with the scale error of these in the covariance.
     """
 
     model: ReducedModel
@@ -229,6 +230,7 @@ class Registration:
     scene: Scene | None = field(default=None, repr=False, compare=False)
     alternatives: tuple[State, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    by_depth: bool = False
 
     def __repr__(self) -> str:
         """One line: what was registered by what, the parameters, and how many warnings there are."""

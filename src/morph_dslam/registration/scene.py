@@ -19,8 +19,8 @@ from morph_dslam.slam.scene import Scene
 Array = NDArray[np.float64]
 #: A view sees an object of which at least this part projects into its image.
 SEEN_SHARE = 0.5
-#: Standard deviation of what all lengths of a metric map are off by together, a share: no residual of the map shows it.
-#: Data sheets of depth cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
+#: Standard deviation of what all lengths of a metric map are off by together, a share, or all depths of a depth camera:
+#: no residual shows it. Data sheets of depth cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
 METRIC_SCALE_STD = 0.01
 
 

@@ -104,6 +104,10 @@ class PointDepths:
         """These, without what is not ``kept`` (p,)."""
         return PointDepths(self.depths, np.where(kept, self.weights, 0.0), self.squared_px, self.huber_px)
 
+    def scaled(self, factor: float) -> PointDepths:
+        """These, all of them so many times as far away, as a depth camera whose scale is off has them."""
+        return PointDepths(self.depths * factor, self.weights, self.squared_px, self.huber_px)
+
     def padded(self, count: int) -> PointDepths:
         """These, followed by points without depth, ``count`` in all."""
         missing = np.zeros(count - len(self.depths))

@@ -7,15 +7,19 @@ those of one material point, as of points whose pixels are measured, a sheet tur
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
 from morph_dslam.errors import RegistrationError
+from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.sources.recorded import DEPTH_SCALE
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
+from morph_dslam.tracking.depth_scale import scale_slopes
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.known_state import DepthTerm
 from morph_dslam.tracking.levenberg_marquardt import Minimum
@@ -43,6 +47,8 @@ def refine_by_depth(
 ) -> Estimate:
     """The state of an object from landmarks and a depth image of the same view.
 
+    Its covariance contains that all depths may be too large by one factor, which no residual of depths shows.
+
     Parameters
     ----------
     landmarks : k of them, bound.
@@ -56,7 +62,7 @@ def refine_by_depth(
     RegistrationError
         If there is hardly any depth where the landmarks have the object.
     """
-    found = None
+    found, by_scale = None, np.zeros(0)
     for _ in range(ROUNDS):
         points, places, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m)
         depths = measured.only(near)
@@ -69,10 +75,12 @@ def refine_by_depth(
                 f"--depth-per-metre, {DEPTH_SCALE}, or the landmarks"
             )
         term = _term(estimator, state, points, places, depths)
-        found = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state).minimum()
+        found, by_scale = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state).minimum()
         state = found.state
     assert found is not None
-    return estimator.finished(found, np.ones(len(pixels)), np.full(len(pixels), 2))
+    estimate = estimator.finished(found, np.ones(len(pixels)), np.full(len(pixels), 2))
+    moved_by = METRIC_SCALE_STD * by_scale
+    return replace(estimate, covariance=estimate.covariance + np.outer(moved_by, moved_by))
 
 
 class _DepthFit:
@@ -91,8 +99,11 @@ class _DepthFit:
         self._sigma_px, self._term, self._start = sigma_px, term, start
         self._scale = STEP * estimator.box.scale
 
-    def minimum(self) -> Minimum:
-        """Where both fit best, parameters that are known held; the Hessian is that of all unknowns."""
+    def minimum(self) -> tuple[Minimum, Array]:
+        """Where both fit best, parameters that are known held; the Hessian is that of all unknowns.
+
+        Also how far that state moves (d + 6,), to first order, for all depths together, as a share of each.
+        """
         box, d = self._estimator.box, len(self._start.parameters)
         free = np.concatenate([box.upper > box.lower, np.ones(6, dtype=bool)])
         columns = np.eye(d + 6)[:, free]
@@ -105,7 +116,15 @@ class _DepthFit:
         slopes = np.asarray(approx_fprime(step, self._residuals, DIFFERENCE)) / self._scale
         variance, converged = self._sigma_px**2, found.status > 0
         hessian = variance * slopes.T @ slopes
-        return Minimum(self._at(step), variance * found.cost, hessian, self._away(step), found.nfev, converged)
+        at = self._at(step)
+        best = Minimum(at, variance * found.cost, hessian, self._away(step), found.nfev, converged)
+        by_scale = np.zeros((len(slopes), 1))
+        by_scale[2 * len(self._pixels) :, 0] = scale_slopes(self._term, self._estimator.camera, at)
+        scale = self._scale[free]
+        taken = np.linalg.lstsq(slopes[:, free] * scale, -by_scale)[0][:, 0]
+        moves = np.zeros(d + 6)
+        moves[free] = scale * taken
+        return best, moves
 
     def _at(self, step: Array) -> State:
         return self._estimator.box.nearest(moved(self._start, step * self._scale))

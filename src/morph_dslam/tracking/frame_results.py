@@ -147,7 +147,8 @@ def _with_systematic_errors(
     # Learned from the images alone, and from residuals that are the object's.
     learns = whole and blurred is None and not len(view.estimation.known.indices)
     found, prior = hypothesis.estimate, hypothesis.prior
-    estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred)
+    depths = hypothesis.point_depths
+    estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, depths)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if blurred is not None:
         warnings.append(BlurredByMotion(path_length(blurred[hypothesis.inliers])))

@@ -46,9 +46,9 @@ def refuted_values(
         alone = estimation.fitted(hypothesis)
         common_px = max(systematic.unexplained(alone, hypothesis.inliers).px, doubt_px)
         weights, prior = hypothesis.weights, hypothesis.prior
-        blurred = hypothesis.blurred
+        blurred, depths = hypothesis.blurred, hypothesis.point_depths
         learns = learns and blurred is None
-        alone = systematic.added(alone, weights, common_px, prior, learns, keeps=False, blurred=blurred)
+        alone = systematic.added(alone, weights, common_px, prior, learns, keeps=False, blurred=blurred, depths=depths)
     found, variances = alone.state.parameters[rows], deviations**2 + np.diag(alone.covariance)[rows]
     if errors is not None:
         variances = variances + np.diag(errors.at(alone.state.parameters).parameters)[rows]

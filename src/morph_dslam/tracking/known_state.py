@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,6 +44,10 @@ class LandmarkTerm:
         """(2 k,) in standard deviations."""
         return self.away(camera, state).ravel()
 
+    def scaled(self, factor: float) -> LandmarkTerm:
+        """The same, had the depth camera measured all depths so many times as large."""
+        return self
+
 
 @dataclass(frozen=True)
 class DepthTerm:
@@ -61,6 +65,10 @@ class DepthTerm:
     recorded: Array
     depths: PointDepths
     share: float = 1.0
+
+    def scaled(self, factor: float) -> DepthTerm:
+        """The same with all depths so many times as large."""
+        return replace(self, depths=self.depths.scaled(factor))
 
     def residuals(self, camera: Camera, state: State) -> Array:
         """(p,) in standard deviations; 0 where a pixel does not see the object."""
@@ -86,6 +94,10 @@ class LandmarkDepthTerm(LandmarkTerm):
         """(2 k + p,) in standard deviations."""
         return np.concatenate([super().residuals(camera, state), self.depth.residuals(camera, state)])
 
+    def scaled(self, factor: float) -> LandmarkDepthTerm:
+        """The same with all depths so many times as large."""
+        return replace(self, depth=self.depth.scaled(factor))
+
 
 @dataclass(frozen=True)
 class StateTerm:
@@ -107,6 +119,10 @@ class StateTerm:
         turned = pose_increment(self.state.camera_from_object, state.camera_from_object)
         away = np.concatenate([state.parameters - self.state.parameters, turned])
         return np.asarray(self._whitening @ away)
+
+    def scaled(self, factor: float) -> StateTerm:
+        """The same: what depths of its own frame have put into it is in its covariance."""
+        return self
 
     @cached_property
     def _whitening(self) -> Array:

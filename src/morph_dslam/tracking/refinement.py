@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 
 from morph_dslam.model import ReducedModel
+from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth_scale import scale_slopes
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.outline import OutlineMeasurement
@@ -152,9 +154,10 @@ def refine_reference(
     n_known, n_points = len(known.residuals(camera, start)), len(reference_pixels)
     jacobian = _derivatives(residuals, found.x, n_known)
     rows = np.split(jacobian[n_known:], np.cumsum(_sizes(keyframes, n_points))[:-1]) if keyframes else []
-    covariance = np.zeros((d + 6, d + 6))
-    covariance[np.ix_(free, free)] = _covariance(jacobian[:n_known], rows, 2 * n_points)
-    return reference(found.x), covariance * np.outer(scale, scale)
+    covariance, refined = np.zeros((d + 6, d + 6)), reference(found.x)
+    by_scale = METRIC_SCALE_STD * scale_slopes(known, camera, refined)
+    covariance[np.ix_(free, free)] = _covariance(jacobian[:n_known], rows, 2 * n_points, by_scale)
+    return refined, covariance * np.outer(scale, scale)
 
 
 def _derivatives(residuals: Callable[[Array], Array], at: Array, n_known: int) -> Array:
@@ -178,7 +181,7 @@ def _sizes(keyframes: Sequence[Keyframe], n_points: int) -> list[int]:
     return [2 * (n_points + (0 if frame.outline is None else len(frame.outline.pixels))) for frame in keyframes]
 
 
-def _covariance(known: Array, keyframes: Sequence[Array], n_points: int) -> Array:
+def _covariance(known: Array, keyframes: Sequence[Array], n_points: int, by_scale: Array) -> Array:
     """That of the minimum (k, k) by derivatives of the residuals by its k unknowns.
 
     A point errs alike in all keyframes: its place was read off the reference view once, and the model is off in the
@@ -188,10 +191,12 @@ def _covariance(known: Array, keyframes: Sequence[Array], n_points: int) -> Arra
     ----------
     known : (n, k) of what the registration rests on.
     keyframes : (m, k) of each, those of ``n_points`` numbers of the reference view first.
+    by_scale : (n,) by which the scale of all depths, of one standard deviation, moves the residuals of ``known``.
     """
     lasting = np.sum([rows[:n_points] for rows in keyframes], axis=0) if keyframes else known[:0]
     independent = [known, *(rows[n_points:] for rows in keyframes)]
-    spread = lasting.T @ lasting + np.sum([rows.T @ rows for rows in independent], axis=0)
+    pushed = known.T @ by_scale
+    spread = np.outer(pushed, pushed) + lasting.T @ lasting + np.sum([rows.T @ rows for rows in independent], axis=0)
     inverse = np.linalg.pinv(known.T @ known + np.sum([rows.T @ rows for rows in keyframes], axis=0))
     return np.asarray(inverse @ spread @ inverse)
 

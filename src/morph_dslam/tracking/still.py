@@ -19,8 +19,10 @@ from scipy.optimize import OptimizeResult
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
+from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth_scale import LARGER, SMALLER
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
@@ -211,6 +213,19 @@ class StillProblem:
             found[rows] -= by_own[rows] @ made_good
         return found
 
+    def _scale_slopes(self, unknowns: Array) -> Array:
+        """Derivatives (r,) of the residuals by all depths together, as a share of each, at given own parameters."""
+        known, recorded, found = self._known, self._recorded, []
+        for factor in (LARGER, SMALLER):
+            self._known = known.scaled(factor)
+            self._recorded = [
+                frame if frame.depths is None else replace(frame, depths=frame.depths.scaled(factor))
+                for frame in recorded
+            ]
+            found.append(self.residuals(unknowns, refit=False))
+        self._known, self._recorded = known, recorded
+        return np.asarray((found[0] - found[1]) / (LARGER - SMALLER))
+
     def _rows(self, count: int) -> list[slice]:
         """Of each keyframe's among so many residuals."""
         found: list[slice] = []
@@ -311,6 +326,9 @@ class StillProblem:
             to_state[-1, n - 1] *= self._magnified(unknowns)
             by_focal = TERM_STD["focal"] * state.camera_from_object.translation[2]
             to_state[-1, n + self._terms.index("focal")] = by_focal
+        # All depths may be off by one factor, in the reference frame and in the keyframes alike.
+        by_scale = METRIC_SCALE_STD * (inverse @ (jacobian.T @ self._scale_slopes(unknowns)))
+        inverse = inverse + np.outer(by_scale, by_scale)
         covariance = to_state @ inverse @ to_state.T
         by_unknown = np.sqrt(np.diag(inverse)[n:])
         terms: dict[str, tuple[float, float]] = {}

@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors, held_by
+from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.tracking.reprojection import project_with_jacobian
 
@@ -190,6 +192,7 @@ class SystematicErrors:
     parts : the reference images that they were bound in
     window : side of the square that is compared around a point, pixels
     still : whether the reference view's pose is that of every frame, with the same error
+    scale_std : as in `CommonDepthScale`
 
     Attributes
     ----------
@@ -197,9 +200,16 @@ class SystematicErrors:
     """
 
     def __init__(
-        self, estimator: Estimator, points: BoundPoints, parts: Sequence[BoundPart], window: int, still: bool = False
+        self,
+        estimator: Estimator,
+        points: BoundPoints,
+        parts: Sequence[BoundPart],
+        window: int,
+        still: bool = False,
+        scale_std: float = 0.0,
     ) -> None:
         self._estimator, self._points, self._still = estimator, points, still
+        self._scale = CommonDepthScale(scale_std, estimator.scale)
         self._misfit = ReferenceMisfit()
         self._corners = points.corners(estimator.model)
         edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
@@ -233,6 +243,7 @@ class SystematicErrors:
         self._by_reference = np.zeros((size, n_factors))
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
         self._by_known = np.zeros((size, size))
+        self._scale.forget_frames()
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
@@ -275,8 +286,9 @@ class SystematicErrors:
         past_information: Array | None = None,
         keeps: bool = True,
         blurred: Array | None = None,
+        depths: PointDepths | None = None,
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors, and that of motion blur.
+        """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
 
         Parameters
         ----------
@@ -289,6 +301,7 @@ class SystematicErrors:
         past_information : (d + 6, d + 6) with which earlier frames count in it; None where they do not
         keeps : whether later frames rest on it
         blurred : (p, 2) pixels, the paths over which motion smears the points; None where it does no harm.
+        depths : (p,) of the points, where a depth camera saw them; None without one.
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
@@ -322,8 +335,14 @@ class SystematicErrors:
         if blurred is not None:
             by_blur = self.pushed_by_blur(frame, np.eye(len(gain)), gain, blurred)
             covariance += by_blur @ by_blur.T
+        push, of_depths = self._scale.push(self._points, estimate.state, past, depths)
+        by_scale = gain @ push
+        if of_depths.any():
+            by_scale = inverse_of_seen(hessian + of_depths, self._estimator.scale) @ push
+        covariance += np.outer(by_scale, by_scale)
         if keeps:
             self._by_reference, self._by_model, self._by_known = by_reference, by_model, gain @ known
+            self._scale.keep(by_scale)
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
     def _learn_reference(self, frame: Linearization, left: Array) -> None:

@@ -270,15 +270,15 @@ class ActiveView:
         options: TrackerOptions,
         number: int = 0,
         error: float = 0.0,
+        scale_std: float = 0.0,
     ) -> ActiveView:
-        """A view that is to be followed from now on, with these numbers."""
+        """A view that is to be followed from now on, with these numbers; ``scale_std`` as in `CommonDepthScale`."""
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
         systematic = None
         if not reference.outline_alone:
-            systematic = SystematicErrors(
-                estimator, reference.points, reference.parts, PATCH_WINDOW, options.pose == "still" and not number
-            )
+            still, parts = options.pose == "still" and not number, reference.parts
+            systematic = SystematicErrors(estimator, reference.points, parts, PATCH_WINDOW, still, scale_std)
         return cls(number, reference, estimation, recovery, systematic, error)
 
 
@@ -326,17 +326,20 @@ class ViewSet:
     Parameters
     ----------
     reference : the first view.
+    scale_std : as in `CommonDepthScale`.
 
     Attributes
     ----------
     active : the view that frames are compared with; whoever follows the object changes it.
     """
 
-    def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
-        self._estimator, self._options = estimator, options
+    def __init__(
+        self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions, scale_std: float = 0.0
+    ) -> None:
+        self._estimator, self._options, self._scale_std = estimator, options, scale_std
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         self._samples = SurfaceSamples(estimator, reference.surface)
-        self.active = ActiveView.of(reference, estimator, options)
+        self.active = ActiveView.of(reference, estimator, options, scale_std=scale_std)
         self._kept, self._seen = [self.active], [reference.shown(self._samples)]
         self._n_made, self._n_frames, self._pause = 0, 0, 0
         self._followed = self.active
@@ -449,7 +452,9 @@ class ViewSet:
             self.active.reference.take_features()
             return None
         self._n_made += 1
-        view = ActiveView.of(begun.reference, self._estimator, self._options, self._n_made, begun.error)
+        view = ActiveView.of(
+            begun.reference, self._estimator, self._options, self._n_made, begun.error, self._scale_std
+        )
         self._kept.append(view)
         self._seen.append(begun.seen)
         if len(self._kept) > self._options.max_views:
