@@ -190,6 +190,15 @@ def test_a_video_whose_edit_list_leaves_frames_out_is_whole(tmp_path):
         list(open_source(path))
 
 
+@pytest.mark.parametrize("name", ["groundtruth.txt", "notes.nfo", "log.vt"])
+def test_text_is_no_video_whatever_its_name(tmp_path, name):
+    """FFmpeg draws the lines of files with such names as pictures."""
+    path = tmp_path / name
+    path.write_text("".join(f"{k / 30:.6f} 0.1 0.2 0.3 0 0 0 1\n" for k in range(200)))
+    with pytest.raises(SourceError, match=f"{name} holds text and no video"):
+        open_source(path)
+
+
 def test_video_without_its_index_cannot_be_opened(tmp_path):
     path = make_video(tmp_path / "clip.mp4", "mp4v")
     data = path.read_bytes()

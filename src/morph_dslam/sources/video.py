@@ -16,6 +16,8 @@ from morph_dslam.sources.frames import Frame, check_range, frame_rate, open_capt
 LENGTH_TOLERANCE = 1
 #: Containers that declare the number of frames; an edit list of an mp4 file may leave some of them out.
 _COUNTED = (".mp4", ".mov", ".avi")
+#: What FFmpeg calls the codecs by which it draws text as pictures: it takes any text for these if its name ends so.
+_DRAWN_TEXT = tuple(cv2.VideoWriter.fourcc(*name) for name in ("ansi", "bint", "xbin"))
 
 
 def _open(path: Path) -> cv2.VideoCapture:
@@ -25,6 +27,9 @@ def _open(path: Path) -> cv2.VideoCapture:
             f"{path} cannot be opened as a video: it is damaged, cut short before its index, or of a kind "
             "that OpenCV does not read; copy it again or convert it to mp4"
         )
+    if int(capture.get(cv2.CAP_PROP_FOURCC)) in _DRAWN_TEXT:
+        capture.release()
+        raise SourceError(f"{path} holds text and no video: name a video file, or a folder of images")
     return capture
 
 
