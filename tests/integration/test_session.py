@@ -372,10 +372,10 @@ class DepthFilm:
 
 
 def test_depth_images_count_live(model, rig_films):
-    """The place along the sight line is known much better with them; frames may be dropped."""
+    """The place along the sight line is known much better with them, whose scale is right; frames may be dropped."""
     first, error, deviation = rig_films[0].frame(sheet_state(0.0)), {}, {}
     for use_depth in (False, True):
-        options, found = md.TrackerOptions(use_depth=use_depth, depth_sigma=1e-4), []
+        options, found = md.TrackerOptions(use_depth=use_depth, depth_sigma=1e-4, depth_scale_std=0.0), []
         tracker = Tracker(model, FRONT.camera, Registration(model, sheet_state(0.0)), options, reference=first)
         with PacedRecording(DepthFilm(model, rig_films)) as stream:
             md.Session({"sheet": tracker}, stream, [found.append]).run()

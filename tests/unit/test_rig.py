@@ -16,6 +16,7 @@ from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
@@ -257,16 +258,20 @@ def check_prediction(model, pictures):
     found, seen, trackers = estimated(model, pictures)
     plain = replace(found, covariance=np.zeros((9, 9)))
     stated = RigErrors(trackers, RIG).added(plain, seen, None, [0.0] * len(RIG)).covariance
-    pose, true = found.state.camera_from_object, LATER.camera_from_object
+    assert_moved_as_stated(LATER, found.state, stated, trackers[0].estimator.scale)
+
+
+def assert_moved_as_stated(before, after, stated, scale):
+    """One deviation of a cause, whose covariance (9, 9) is stated, has moved a state."""
+    pose, true = after.camera_from_object, before.camera_from_object
     turn = pose.rotation @ true.rotation.T
     away = np.concatenate(
         [
-            found.state.parameters - LATER.parameters,
+            after.parameters - before.parameters,
             0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]),
             pose.translation - true.translation,
         ]
     )
-    scale = trackers[0].estimator.scale
     away, deviations = away / scale, np.sqrt(np.diag(stated)) / scale
     assert np.linalg.norm(away) > 1e-4
     np.testing.assert_allclose(deviations, np.abs(away), atol=0.1 * np.linalg.norm(away))
@@ -291,3 +296,17 @@ def test_nothing_is_added_where_nothing_is_known(model):
     assert max(rest.px for rest in left) < 1e-6
     stated = errors.added(found, seen, None, [rest.px for rest in left])
     np.testing.assert_allclose(stated.covariance, found.covariance, atol=1e-12)
+
+
+def test_the_scale_of_a_depth_camera_moves_the_estimate_of_a_rig_as_predicted(model):
+    """All depths of the first camera are 0.2 % too large; parallax holds against them."""
+    _, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
+    estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
+    front, *others = seen.views
+    count = len(front.points)
+    depths = PointDepths(front.points.in_camera(RIG[0].seen(LATER))[:, 2], np.full(count, 2000.0), 1.0, 1e6)
+    right, wrong = (RigObservations((replace(front, depths=depths.scaled(f)), *others)) for f in (1.0, 1.002))
+    before, after = estimator.fit(right, LATER), estimator.fit(wrong, LATER)
+    plain = replace(before, covariance=np.zeros((9, 9)))
+    stated = RigErrors(trackers, RIG, depth_std=0.002).added(plain, right, None, [0.0] * len(RIG)).covariance
+    assert_moved_as_stated(before.state, after.state, stated, estimator.scale)

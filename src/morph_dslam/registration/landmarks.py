@@ -44,7 +44,7 @@ from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.compilation import announce_compilation
-from morph_dslam.tracking.depth import SIGMA_AT_1M
+from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M
 from morph_dslam.tracking.depth_registration import refine_by_depth, share_behind
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.rig import RigCamera
@@ -73,6 +73,7 @@ def register_landmarks(
     near: State | None = None,
     image: NDArray[np.uint8] | None = None,
     others: Sequence[tuple[RigCamera, Landmarks]] = (),
+    depth_scale_std: float = SCALE_STD,
 ) -> Registration:
     """The object in the frame in which the landmarks were set.
 
@@ -92,6 +93,7 @@ def register_landmarks(
         (`outline_snap`); None to rely on them alone. Depth decides instead where there is any.
     others : further cameras fixed to ``camera``, each (``RigCamera`` of `morph_dslam.extend.registration`) with the
         landmarks in what it saw at the same instant. All count together; depth and image correct those of one camera.
+    depth_scale_std : standard deviation of what all depths are off by together, a share.
 
     Raises
     ------
@@ -123,7 +125,9 @@ def register_landmarks(
     placed = _Placed(fit.best, fit.covariance, fit.measured, alternatives)
     moved = fit.not_at_rest([] if near is not None else shape_starts(model)) if at_rest else None
     if depth is not None:
-        placed = _by_depth(fit, alternatives, camera.checked_depth(depth, "the depth"), depth_sigma, at_rest)
+        placed = _by_depth(
+            fit, alternatives, camera.checked_depth(depth, "the depth"), (depth_sigma, depth_scale_std), at_rest
+        )
     elif image is not None:
         placed = _by_outline(fit, placed, undistorted_grey(camera, image))
     facts = _facts(fit, len(alternatives)) | placed.facts
@@ -177,16 +181,20 @@ def _precise(fit: LandmarkFit) -> Estimator:
 
 
 def _by_depth(
-    fit: LandmarkFit, alternatives: tuple[State, ...], depth: NDArray[np.float32], depth_sigma: float, at_rest: bool
+    fit: LandmarkFit,
+    alternatives: tuple[State, ...],
+    depth: NDArray[np.float32],
+    deviations: tuple[float, float],
+    at_rest: bool,
 ) -> _Placed:
-    """The object along the sight line by the frame's depth (h, w), whose deviation at 1 m is given."""
+    """The object along the sight line by the frame's depth (h, w), with its deviations at 1 m and of its scale."""
     # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
     sigma = max(fit.best.sigma_px, LEAST_PX) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
     landmarks = fit.landmarks
     precise = _precise(fit)
-    best = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, depth_sigma)
+    best = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, *deviations)
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
-    facts, behind = {"along_the_sight_line": "by depth"}, share_behind(precise, best.state, depth, depth_sigma)
+    facts, behind = {"along_the_sight_line": "by depth"}, share_behind(precise, best.state, depth, deviations[0])
     return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind)
 
 

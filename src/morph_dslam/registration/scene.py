@@ -15,13 +15,13 @@ from morph_dslam.registration.rectification import rectified_image
 from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.rolling_shutter import middle_row_pixels
 from morph_dslam.slam.scene import Scene
+from morph_dslam.tracking.depth import SCALE_STD
 
 Array = NDArray[np.float64]
 #: A view sees an object of which at least this part projects into its image.
 SEEN_SHARE = 0.5
-#: Standard deviation of what all lengths of a metric map are off by together, a share, or all depths of a depth camera:
-#: no residual shows it. Data sheets of depth cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
-METRIC_SCALE_STD = 0.01
+#: Standard deviation of what all lengths of a metric map are off by together, a share: as much as all depths are.
+METRIC_SCALE_STD = SCALE_STD
 
 
 @dataclass(frozen=True)

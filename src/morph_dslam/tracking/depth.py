@@ -22,6 +22,9 @@ from morph_dslam.tracking.state import BoundPoints, State
 Array = NDArray[np.float64]
 #: Standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
 SIGMA_AT_1M = 2.0e-3
+#: Standard deviation of what all depths are off by together, a share: no residual shows it. Data sheets of depth
+#: cameras allow twice as much (Intel RealSense D400: 2 % of the distance).
+SCALE_STD = 0.01
 #: Neighbours nearer than this, pixels, have the same error, as those of structured light have.
 ALIKE_PX = 3
 #: Side of the square of pixels through which a plane is laid.

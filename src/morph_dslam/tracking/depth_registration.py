@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.sources.recorded import DEPTH_SCALE
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
-from morph_dslam.tracking.depth import SIGMA_AT_1M, PointDepths
+from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M, PointDepths
 from morph_dslam.tracking.depth_scale import scale_slopes
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.known_state import DepthTerm
@@ -44,6 +43,7 @@ def refine_by_depth(
     sigma_px: float,
     image: NDArray[np.float32],
     sigma_at_1m: float = SIGMA_AT_1M,
+    scale_std: float = SCALE_STD,
 ) -> Estimate:
     """The state of an object from landmarks and a depth image of the same view.
 
@@ -56,6 +56,8 @@ def refine_by_depth(
     state : as the landmarks have it.
     sigma_px : how exactly they were set.
     image : (h, w) as recorded, metres, NaN where unknown.
+    sigma_at_1m : standard deviation of a pixel's depth at 1 m, metres.
+    scale_std : of what all depths are off by together, a share.
 
     Raises
     ------
@@ -79,7 +81,7 @@ def refine_by_depth(
         state = found.state
     assert found is not None
     estimate = estimator.finished(found, np.ones(len(pixels)), np.full(len(pixels), 2))
-    moved_by = METRIC_SCALE_STD * by_scale
+    moved_by = scale_std * by_scale
     return replace(estimate, covariance=estimate.covariance + np.outer(moved_by, moved_by))
 
 

@@ -138,7 +138,8 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
-        self._errors = RigErrors(self.trackers, self.cameras)
+        depth_std = 0.0 if registration.by_depth else self.options.depth_scale_std
+        self._errors = RigErrors(self.trackers, self.cameras, depth_std)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._sigma_px = FIRST_SIGMA_PX

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from morph_dslam.tracking.depth import SIGMA_AT_1M
+from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M
 from morph_dslam.tracking.discrepancy import DiscrepancyOptions
 from morph_dslam.tracking.estimator import EstimationOptions
 from morph_dslam.tracking.option_values import CheckedOptions, Count, NotNegative, Positive, PositiveCount, Share
@@ -57,6 +57,7 @@ class TrackerOptions(CheckedOptions):
     modulus_std : standard deviation of a factor common to all moduli, a share (0.05 for 5 %); it counts in the
         reactions.
     depth_sigma : standard deviation of one pixel's depth at 1 m, metres; it grows with the distance squared.
+    depth_scale_std : standard deviation of what all depths are off by together, a share (0.01 for 1 %).
     use_discrepancy : whether to look for what the object's shape has beyond the model's.
     use_unknown_loads : whether loads that the study does not foresee are estimated too (`estimation.loads`).
     per_sequence : names of the parameters that are one over the whole sequence.
@@ -103,6 +104,7 @@ class TrackerOptions(CheckedOptions):
     max_views: PositiveCount = 12
     further_views: bool = True
     depth_sigma: Positive = SIGMA_AT_1M
+    depth_scale_std: NotNegative = SCALE_STD
     discrepancy: DiscrepancyOptions = field(default_factory=DiscrepancyOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.tracking.binding import bind_pixels, view_of
-from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth import SCALE_STD, PointDepths
 from morph_dslam.tracking.depth_scale import scale_slopes
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
@@ -110,6 +109,7 @@ def refine_reference(
     reference_pixels: Array,
     start: State,
     keyframes: Sequence[Keyframe],
+    depth_scale_std: float = SCALE_STD,
 ) -> tuple[State, Array]:
     """The reference state that explains the registration and the keyframes best, in which no unknown loads act.
 
@@ -119,6 +119,7 @@ def refine_reference(
     reference_pixels : (p, 2) of the followed points in the reference view.
     start : the registered state.
     keyframes : where these points were seen in other frames.
+    depth_scale_std : standard deviation of what all depths are off by together, a share.
 
     Returns
     -------
@@ -155,7 +156,7 @@ def refine_reference(
     jacobian = _derivatives(residuals, found.x, n_known)
     rows = np.split(jacobian[n_known:], np.cumsum(_sizes(keyframes, n_points))[:-1]) if keyframes else []
     covariance, refined = np.zeros((d + 6, d + 6)), reference(found.x)
-    by_scale = METRIC_SCALE_STD * scale_slopes(known, camera, refined)
+    by_scale = depth_scale_std * scale_slopes(known, camera, refined)
     covariance[np.ix_(free, free)] = _covariance(jacobian[:n_known], rows, 2 * n_points, by_scale)
     return refined, covariance * np.outer(scale, scale)
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.covariance import held_by
+from morph_dslam.tracking.depth import SCALE_STD
+from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
@@ -56,9 +58,10 @@ class RigErrors:
     trackers : by camera, each at its one reference view, which knows how its images are off by the error
         factors that are the same for all.
     cameras : of the rig.
+    depth_std : standard deviation of the scale of all depths, a share; zero where the reference state holds it already.
     """
 
-    def __init__(self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera]) -> None:
+    def __init__(self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera], depth_std: float = SCALE_STD) -> None:
         parts = [part for tracker in trackers for part in tracker.reference.parts]
         self._is_known = all(part.error_factors is not None for part in parts)
         self._cameras, self._scale = cameras, trackers[0].estimator.scale
@@ -67,7 +70,8 @@ class RigErrors:
             SystematicErrors(tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW)
             for tracker in trackers
         ]
-        self._counts = [len(tracker.reference.points) for tracker in trackers]
+        self._points = [tracker.reference.points for tracker in trackers]
+        self._depths = CommonDepthScale(depth_std, self._scale)
         self._by_known = np.zeros((len(self._scale),) * 2)
 
     def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
@@ -86,7 +90,7 @@ class RigErrors:
         blurred: Sequence[Array | None] | None = None,
         known: Array | float = 0.0,
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors, and that of motion blur.
+        """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
 
         Parameters
         ----------
@@ -113,6 +117,8 @@ class RigErrors:
             if paths is not None:
                 moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
                 covariance = covariance + moved @ moved.T
+        moved = self._moved_by_depths(hessian, views, measured)
+        covariance = covariance + np.outer(moved, moved)
         self._by_known = gain @ (known + np.zeros_like(hessian))
         if self._is_known:
             pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
@@ -120,15 +126,26 @@ class RigErrors:
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
+    def _moved_by_depths(self, hessian: Array, views: Sequence[_View], measured: RigObservations) -> Array:
+        """How one standard deviation of the scale of all depths moves the estimate (d + 6,) of points' ``hessian``."""
+        total, push = hessian.copy(), np.zeros(len(hessian))
+        for points, view, seen in zip(self._points, views, measured.views, strict=True):
+            depths = None if seen.depths is None else seen.depths.take(np.arange(len(points)))
+            pushed, of_depths = self._depths.push(points, view.estimate.state, np.zeros_like(hessian), depths)
+            push += view.chain.T @ pushed
+            total += view.chain.T @ of_depths @ view.chain
+        return inverse_of_seen(total, self._scale) @ push if push.any() else push
+
     def held(self, measured: NDArray[np.int64]) -> Array:
         """As `SystematicErrors.held`, of the last estimate of all cameras."""
         return held_by(self._by_known, measured)
 
     def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
         views, first = [], 0
-        for part, chain, systematic, count, view in zip(
-            self._cameras, self._chains, self._systematic, self._counts, measured.views, strict=True
+        for part, chain, systematic, points, view in zip(
+            self._cameras, self._chains, self._systematic, self._points, measured.views, strict=True
         ):
+            count = len(points)
             seen = replace(
                 estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
             )

@@ -97,9 +97,17 @@ class TrackedObject:
             depth = frame.depth if self.options.use_depth and not others else None
             at_rest = self.at_rest and start is self.start
             image = np.asarray(frame.image, dtype=np.uint8) if self.snap else None
-            sigma = self.options.depth_sigma
             return register_landmarks(
-                self.model, camera, start, self.click_px, depth, sigma, at_rest, image=image, others=others
+                self.model,
+                camera,
+                start,
+                self.click_px,
+                depth,
+                self.options.depth_sigma,
+                at_rest,
+                image=image,
+                others=others,
+                depth_scale_std=self.options.depth_scale_std,
             )
         return register_by_initializer(start, self.model, camera, np.asarray(frame.image, dtype=np.uint8))
 

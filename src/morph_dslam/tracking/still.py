@@ -19,9 +19,8 @@ from scipy.optimize import OptimizeResult
 
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
-from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.tracking.binding import bind_pixels, view_of
-from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth import SCALE_STD, PointDepths
 from morph_dslam.tracking.depth_scale import LARGER, SMALLER
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
@@ -98,6 +97,7 @@ class StillProblem:
     constant : indices of the parameters that are one over the sequence.
     known_at_first : indices of the parameters that are known in the reference frame, which shows the object at rest.
     terms : of the camera that are estimated.
+    depth_scale_std : standard deviation of what all depths are off by together, a share.
     """
 
     def __init__(
@@ -111,9 +111,11 @@ class StillProblem:
         constant: Sequence[int] = (),
         known_at_first: Sequence[int] = (),
         terms: Sequence[CameraTerm] = (),
+        depth_scale_std: float = SCALE_STD,
     ) -> None:
         self._model, self._camera, self._start, self._known = model, camera, start, known
         self._constant, self._terms, d = list(constant), tuple(terms), len(model.parameters)
+        self._depth_scale_std = depth_scale_std
         self._free = np.setdiff1d(np.arange(d), self._constant)
         self._scale = reference_scale(model)
         self._columns = np.setdiff1d(np.arange(d + 6), known_at_first)
@@ -327,7 +329,7 @@ class StillProblem:
             by_focal = TERM_STD["focal"] * state.camera_from_object.translation[2]
             to_state[-1, n + self._terms.index("focal")] = by_focal
         # All depths may be off by one factor, in the reference frame and in the keyframes alike.
-        by_scale = METRIC_SCALE_STD * (inverse @ (jacobian.T @ self._scale_slopes(unknowns)))
+        by_scale = self._depth_scale_std * (inverse @ (jacobian.T @ self._scale_slopes(unknowns)))
         inverse = inverse + np.outer(by_scale, by_scale)
         covariance = to_state @ inverse @ to_state.T
         by_unknown = np.sqrt(np.diag(inverse)[n:])

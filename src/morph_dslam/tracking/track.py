@@ -466,7 +466,8 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
     assert isinstance(tracker, Tracker)
     pixels, chosen = tracker.reference.pixels, choose_keyframes(keyframes)
     if not part.options.use_discrepancy:
-        state, covariance = refine_reference(tracker.estimator, known_state(part), pixels, registration.state, chosen)
+        asked = tracker.estimator, known_state(part), pixels, registration.state, chosen
+        state, covariance = refine_reference(*asked, part.options.depth_scale_std)
         refined = replace(registration, state=state, covariance=covariance)
     else:
         # What the state is wrong by counts with the discrepancy: to refine both would be the same twice.

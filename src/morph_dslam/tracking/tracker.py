@@ -17,7 +17,6 @@ from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
-from morph_dslam.registration.scene import METRIC_SCALE_STD
 from morph_dslam.slam.self_calibration import OffByFactors
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
@@ -516,7 +515,7 @@ class Tracker:
             lasting = None if factors is None else factors[len(self.model.parameters) :]
             self._still = replace(held(known.state, self.estimator), lasting=lasting)
         # A distance by depth holds the depths' scale itself: the frames' depths confirm it, whatever it is.
-        scale_std = 0.0 if known.by_depth else METRIC_SCALE_STD
+        scale_std = 0.0 if known.by_depth else options.depth_scale_std
         self._views = ViewSet(self.estimator, view, options, scale_std)
         self._jumps = JumpDetector(view.points.rest, float(np.linalg.norm(np.ptp(self.model.nodes, axis=0))))
         self._anchoring = Anchoring(self.estimator, view, options)
