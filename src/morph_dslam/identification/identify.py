@@ -1,10 +1,9 @@
 """Identification: the parameters for which a reduced model predicts what was measured best.
 
-Weighted least squares over all measurements, each in units of what it misses in the end. Standard deviations allow for
-errors that belong together, as those of one state: the covariance is A^-1 B A^-1 with A = J'J and B the sum of
-(J_g' r_g)(J_g' r_g)' over groups g (Liang and Zeger 1986), and not less than that of independent errors. To it come
-what was known before, with its own deviation, and the model's errors e, by A^-1 J'e. Intervals are Student's, with as
-many degrees of freedom as there are groups less unknowns, for what scatters, and normal for the rest.
+Weighted least squares over all measurements, each in units of its noise. Standard deviations allow for errors that
+belong together, as those of one state, and for what tables do not know of themselves (`scatter`). To that come what was
+known before, with its own deviation, and the model's errors e, by (J'J)^-1 J'e. Intervals are Student's for what
+scatters, and normal for the rest.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import norm, qmc, t
+from scipy.stats import norm, qmc
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.likeness import root_mean_square
@@ -24,6 +23,7 @@ from morph_dslam.identification.doubts import check_size
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measurements import Measurement
 from morph_dslam.identification.prior import KnownValues
+from morph_dslam.identification.scatter import Design, Noise, Scatter, directions
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.flat_sides import LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
@@ -34,8 +34,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Range of the common factor of all moduli, and its name among the unknowns.
 FACTOR, FACTOR_RANGE = "moduli_factor", (0.01, 100.0)
-#: Starts of the search, so that it does not end in a local minimum (a power of two); rounds of weighting.
-STARTS, ROUNDS = 8, 4
+#: Starts of the search, so that it does not end in a local minimum (a power of two); most rounds of weighting, which
+#: end when no noise changes by more than this share.
+STARTS, ROUNDS, SETTLED = 8, 12, 0.01
+#: Sums of squares that differ by less than this share are alike.
+ALIKE = 1e-6
 #: An estimate so near to an end of its range, over the range, is at it.
 AT_THE_END = 1e-6
 #: Values of a parameter at which the whole range is searched for others that fit as well.
@@ -149,14 +152,19 @@ class _Spread:
     ``groups`` is the number of those whose errors count as independent.
     """
 
-    scatter: Array
+    scatter: Scatter
     known: Array
     model: Array
     groups: int
 
     @property
     def covariance(self) -> Array:
-        return self.scatter + self.known + self.model
+        return self.scatter.covariance + self.known + self.model
+
+    @property
+    def half(self) -> Array:
+        """Half the width (k,) of 95 % intervals."""
+        return np.sqrt(self.scatter.half**2 + float(norm.ppf(0.975)) ** 2 * np.diag(self.known + self.model))
 
 
 class _Values:
@@ -331,18 +339,48 @@ class _Fit:
         return np.concatenate([*parts, self._whitening @ away])
 
     def best(self) -> Array:
-        """The unknowns that fit best, over their ranges; measurements are weighted by what they are missed by."""
+        """The unknowns that fit best, over their ranges; measurements are weighted by the noise that they show."""
         k = len(self._unknowns)
         starts = 0.05 + 0.9 * qmc.Sobol(k, scramble=False).random(STARTS)
         middle = np.full(k, 0.5)
-        # What is predicted to rounding must not get all the weight.
-        least = [1e-6 * max(float(np.abs(m.values).max()), 1e-300) for m in self._measurements]
-        self._noise = np.maximum([float(np.std(m.values)) for m in self._measurements], least)
-        found = min((self._solved(start) for start in (middle, *starts)), key=lambda each: each[0])[1]
-        for _ in range(ROUNDS if len(self._measurements) > 1 else 1):
-            self._noise = np.maximum([root_mean_square(missed) for missed in self._missed(found)], least)
+        self._noise = np.maximum(self._changes(), self._least())
+        ends = [self._solved(start) for start in (middle, *starts)]
+        # Of ends that fit alike, as all along a valley, the first: rounding must not choose.
+        most = (1.0 + ALIKE) * min(cost for cost, _ in ends)
+        found = next(end for cost, end in ends if cost <= most)
+        for _ in range(ROUNDS):
+            before, design = self._noise, self._design(self._jacobian(found), found)
+            self._noise = np.maximum(self._shown(design, found).std, self._least())
             found = self._solved(found)[1]
+            # One table alone has the same weight whatever its noise is.
+            if len(self._measurements) + len(self._is_known) < 2 or np.all(
+                np.abs(self._noise - before) <= SETTLED * before
+            ):
+                break
         return found
+
+    def _changes(self) -> Array:
+        """By how much the load changed the values of each measurement, (m,); those of one unit are alike."""
+        units = [each.unit for each in self._measurements]
+        changes = {
+            unit: np.concatenate([each.changes for each in self._measurements if each.unit == unit]) for unit in units
+        }
+        return np.array([root_mean_square(changes[unit]) for unit in units])
+
+    def _least(self) -> Array:
+        """Noise (m,) of values that are predicted to rounding: they must not get all the weight."""
+        return np.array([1e-6 * max(float(np.abs(m.values).max()), 1e-300) for m in self._measurements])
+
+    def _shown(self, design: Design, theta: Array) -> Noise:
+        units = [each.unit for each in self._measurements]
+        return Noise.shown(design, self._missed(theta), units, self._changes())
+
+    def _design(self, jacobian: Array, theta: Array) -> Design:
+        """With the derivatives (n, k) of all residuals."""
+        pairs = zip(self._predictions(theta), self._measurements, strict=True)
+        loose = [directions(each.loose(predicted)) for (_, predicted), each in pairs]
+        measured = len(jacobian) - len(self._is_known)
+        return Design(jacobian[:measured], jacobian[measured:], loose, self._groups[:measured])
 
     def _solved(self, start: Array) -> tuple[float, Array]:
         inside = np.clip(start, 1e-9, 1.0 - 1e-9)
@@ -361,7 +399,7 @@ class _Fit:
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
             )
         residuals = self._residuals(theta)
-        spread = self._spread(jacobian, residuals, errors)
+        spread = self._spread(theta, jacobian, residuals, errors)
         alike = self._alike(theta, jacobian, float(residuals @ residuals), spread)
         estimates = self._estimates(theta, spread, at_bound, alike)
         std = np.sqrt(np.diag(spread.covariance))
@@ -405,11 +443,8 @@ class _Fit:
         self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_], alike: Array
     ) -> tuple[Estimate, ...]:
         """Those with values that fit ``alike`` (k, 2) have wider intervals."""
-        scatter, known, model = (np.diag(part) for part in (spread.scatter, spread.known, spread.model))
-        std = np.sqrt(scatter + known + model)
-        of_scatter = float(t.ppf(0.975, max(spread.groups - len(theta), 1)))
-        half = np.sqrt(of_scatter**2 * scatter + float(norm.ppf(0.975)) ** 2 * (known + model))
-        below, above = np.maximum(half[:, None], alike).T
+        std, model = np.sqrt(np.diag(spread.covariance)), np.diag(spread.model)
+        below, above = np.maximum(spread.half[:, None], alike).T
         low, high, value = self._si(theta - below), self._si(theta + above), self._si(theta)
         std = np.sqrt(std**2 + flat_variance(alike.max(axis=1)))
         # Over the factor's logarithm a deviation is a relative one.
@@ -472,24 +507,14 @@ class _Fit:
             columns.append(change / (above - below)[i])
         return np.column_stack(columns)
 
-    def _spread(self, jacobian: Array, residuals: Array, errors: Array) -> _Spread:
+    def _spread(self, theta: Array, jacobian: Array, residuals: Array, errors: Array) -> _Spread:
         """Of estimates over their ranges, by the ``errors`` (e, n) of the model among others."""
-        n, k = jacobian.shape
-        measured, left = jacobian[: errors.shape[1]], residuals[: errors.shape[1]]
+        design = self._design(jacobian, theta)
+        noise, measured = self._shown(design, theta), len(design.slopes)
+        scatter = Scatter.of(design, residuals[:measured], (noise.std / self._noise) ** 2, noise)
         # What was known before has the deviation that it came with, even if nothing contradicts it.
-        before = jacobian[len(left) :] * np.maximum(np.abs(residuals[len(left) :]), 1.0)[:, None]
-        inverse = np.linalg.pinv(jacobian.T @ jacobian)
+        before = design.known * np.maximum(np.abs(residuals[measured:]), 1.0)[:, None] @ design.inverse
+        by_model = errors @ design.free @ design.inverse
         # Directions that the measurements do not see are as uncertain as can be.
-        values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-        unseen = vectors[:, values <= 1e-12 * values.max()]
-        scatter = inverse @ measured.T @ measured @ inverse * float(left @ left) / max(n - k, 1) + unseen @ unseen.T
-        groups = len(np.unique(self._groups))
-        if groups > k:
-            scores = np.zeros((groups, k))
-            np.add.at(scores, self._groups[: len(left)], measured * left[:, None])
-            together = inverse @ scores.T @ scores @ inverse * groups / (groups - k)
-            own = np.maximum(np.diag(scatter), np.finfo(float).tiny)
-            wider = np.sqrt(np.maximum(np.diag(together) / own, 1.0))
-            scatter = scatter * np.outer(wider, wider)
-        by_model = errors @ measured @ inverse
-        return _Spread(scatter, inverse @ before.T @ before @ inverse, by_model.T @ by_model, groups)
+        known = before.T @ before + design.unseen @ design.unseen.T
+        return _Spread(scatter, known, by_model.T @ by_model, len(np.unique(self._groups)))

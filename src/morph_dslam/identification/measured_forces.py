@@ -177,6 +177,9 @@ class MeasuredForces:
     def adjusted(self, predicted: Array) -> Array:
         return predicted + float(np.mean(self.values - predicted)) if self.free_zero else predicted
 
+    def loose(self, predicted: Array) -> Array:
+        return np.ones((len(predicted), int(self.free_zero)))
+
     def model_errors(self, unknowns: Unknowns) -> Array:
         stated = force_error(self.model, self.reaction.support)
         if stated is None:

@@ -119,6 +119,16 @@ class MeasuredPoints:
         motion = fit_similarity(predicted.reshape(-1, 3), self.measured, with_scale=False)
         return motion.apply(predicted.reshape(-1, 3)).ravel()
 
+    def loose(self, predicted: Array) -> Array:
+        if not self.aligned:
+            return np.zeros((len(predicted), 0))
+        points = predicted.reshape(-1, 3)
+        arms = points - points.mean(axis=0)
+        # By their size turns count like shifts, and those about the line of points that lie in one are none.
+        arms /= max(float(np.abs(arms).max()), np.finfo(float).tiny)
+        turns = np.cross(np.eye(3)[:, None], arms).reshape(3, -1)
+        return np.vstack([np.tile(np.eye(3), (1, len(points))), turns]).T
+
     def model_errors(self, unknowns: Unknowns) -> Array:
         return shape_errors(self.model, self.positions, unknowns.vector)[:, self._present]
 

@@ -83,6 +83,12 @@ class Measurement(Protocol):
         """Predictions (n,) with what is not known of the measurement itself, such as the zero of a load cell."""
         ...
 
+    def loose(self, predicted: Array) -> Array:
+        """How what is not known of the measurement itself moves adjusted predictions (n,): columns (n, q) that span it,
+        of which the fit takes as many values.
+        """
+        ...
+
     def model_errors(self, unknowns: Unknowns) -> Array:
         """Errors (e, n) of predictions by the model itself, SI, independent of each other, of either sign.
 
