@@ -14,6 +14,7 @@ from morph_dslam.reduction.certificate import (
     confidence_statement,
     covered_share,
     errors_by_modes,
+    typical_sizes,
 )
 from morph_dslam.studies.problem import Snapshot
 
@@ -110,6 +111,24 @@ def test_errors_of_plane_stress_and_of_strain():
     assert certificate["stress_top"]["relative_l2"] is None, "the true stress is zero"
     assert certificate["strain"]["mean"] == pytest.approx(np.sqrt(2) * 0.01)
     assert certificate["strain"]["relative_l2"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("size", "stated"), [(1e-6, False), (1e-3, True)])
+def test_errors_relative_to_rounding_are_not_stated(size, stated):
+    """Stress of 2 MPa times xi: in the held-out solution, near xi = 0, it is a millionth, or a thousandth, of it."""
+    stress = np.zeros((2, 6))
+    stress[:, 0] = 2e6
+    model = two_node_model(stresses={"solid": field_of(0.0 * stress, stress)})
+    sizes = typical_sizes(model, [np.array([mu]) for mu in (-0.005, 0.01, 0.0)])
+    assert sizes["stress_solid"] == pytest.approx(2e6)
+    # At xi = 1 both nodes have (1, 1, 0) and (2, 2, 0) mm.
+    assert sizes["displacement"] == pytest.approx(1e-3 * np.sqrt((2.0 + 8.0) / 2.0))
+    held_out = [displaced(model, 0.01 * size, np.full((2, 3), 1e-5), stress_solid=2.0 * size * stress)]
+    errors = certify(model, held_out, sizes=sizes)
+    assert errors["stress_solid"]["max_MPa"] == pytest.approx(2.0 * size)
+    found = errors["stress_solid"]["relative_l2"], errors["stress_solid"]["von_mises"]["mean_relative_to_largest"]
+    assert found == (pytest.approx((0.5, 0.5)) if stated else (None, None))
+    assert errors["displacement"]["relative_l2"] is not None
 
 
 def test_both_measures_of_sensitivity_errors():

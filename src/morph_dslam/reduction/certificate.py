@@ -13,7 +13,7 @@ between two neighbours of the sweep, a critical point lies between them: a limit
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -104,6 +104,9 @@ CONFIDENCE = 0.95
 #: Squared components in a value's squared norm; of a symmetric tensor the shears stand for two components.
 _NORM_WEIGHTS = {1: [1.0], 3: [1.0, 1.0, 1.0], 6: [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]}
 _PLANE_TENSOR = [1.0, 1.0, 2.0]
+#: True values whose root mean square is below this part of that in the solution where it is largest are rounding of the
+#: solver, as stress after a body was released: errors relative to them say nothing.
+ROUNDING = 1e-5
 _STRESS = "stress_"
 #: Unit in which a field's errors are stated, as the ending of its keys, and what it is in SI.
 _UNITS = {
@@ -140,11 +143,12 @@ class _ErrorTally:
     Parameters
     ----------
     weights : (c,) of the squared components in the squared norm of a value.
+    typical : root mean square of such values in the solution of the study where it is largest, SI; 0 if unknown.
     """
 
-    def __init__(self, weights: Array) -> None:
-        self._weights = weights
-        self._missed, self._norm, self._largest = 0.0, 0.0, 0.0
+    def __init__(self, weights: Array, typical: float = 0.0) -> None:
+        self._weights, self._typical = weights, typical
+        self._missed, self._norm, self._largest, self._count = 0.0, 0.0, 0.0, 0
         self._means: list[float] = []
         self._maxima: list[float] = []
 
@@ -155,6 +159,7 @@ class _ErrorTally:
         size = truth**2 @ self._weights
         self._missed += float(missed.sum())
         self._norm += float(size.sum())
+        self._count += len(size)
         self._largest = max(self._largest, float(np.sqrt(size.max())))
         self._means.append(float(np.sqrt(missed).mean()))
         self._maxima.append(float(np.sqrt(missed.max())))
@@ -170,12 +175,11 @@ class _ErrorTally:
         return np.array(self._maxima)
 
     def relative(self) -> dict[str, float | None]:
-        """The two relative measures; None where all true values are zero."""
+        """The two relative measures; None where all true values are zero but for rounding."""
+        if math.sqrt(self._norm) <= ROUNDING * self._typical * math.sqrt(self._count):
+            return {"relative_l2": None, "mean_relative_to_largest": None}
         mean = float(self.sample_means.mean())
-        return {
-            "relative_l2": math.sqrt(self._missed / self._norm) if self._norm else None,
-            "mean_relative_to_largest": mean / self._largest if self._largest else None,
-        }
+        return {"relative_l2": math.sqrt(self._missed / self._norm), "mean_relative_to_largest": mean / self._largest}
 
     def figures(self, ending: str, unit: float) -> dict[str, Any]:
         """All measures; keys of absolute ones end in ``ending``, and ``unit`` is its size in SI."""
@@ -188,7 +192,27 @@ class _ErrorTally:
         return {f"{name}{ending}": float(value) / unit for name, value in absolute.items()} | self.relative()
 
 
-def certify(model: ReducedModel, held_out: list[Snapshot], scattered: bool = True) -> dict[str, Any]:
+def typical_sizes(model: ReducedModel, states: Iterable[Array]) -> dict[str, float]:
+    """Of each field, the root mean square over the nodes in the state where it is largest, SI.
+
+    Parameters
+    ----------
+    model : which has the fields.
+    states : parameters (d,) of solutions, SI, as of those that it was made from.
+    """
+    states, sizes = list(states), {}
+    for name, field in model.fields.items():
+        weights = _norm_weights(name, field.modes.shape[2])
+        products = np.einsum("inc,jnc,c->ij", field.modes, field.modes, weights, optimize=True) / field.modes.shape[1]
+        values = np.array([field.functions.evaluate(state)[0] for state in states]).reshape(-1, field.n_modes)
+        squares = np.einsum("si,ij,sj->s", values, products, values, optimize=True)
+        sizes[name] = math.sqrt(max(float(squares.max(initial=0.0)), 0.0))
+    return sizes
+
+
+def certify(
+    model: ReducedModel, held_out: list[Snapshot], scattered: bool = True, sizes: Mapping[str, float] | None = None
+) -> dict[str, Any]:
     """Errors of every field of a model over held-out solves, in plain JSON types.
 
     Parameters
@@ -196,6 +220,7 @@ def certify(model: ReducedModel, held_out: list[Snapshot], scattered: bool = Tru
     model : whose errors they are.
     held_out : solves that it was not made from.
     scattered : whether their parameters are uniform in the box, as the statement on the whole box needs.
+    sizes : of each field over all solutions, for what is rounding in the held-out ones (`typical_sizes`).
 
     Returns
     -------
@@ -210,11 +235,12 @@ def certify(model: ReducedModel, held_out: list[Snapshot], scattered: bool = Tru
         modes (`errors_on_modes`).
     """
     certificate: dict[str, Any] = {}
+    sizes = sizes or {}
     for name, field in model.fields.items():
         if name == "displacement":
-            certificate |= _displacement_errors(model, held_out, scattered)
+            certificate |= _displacement_errors(model, held_out, scattered, sizes.get(name, 0.0))
         else:
-            certificate[name] = field_errors(name, _pairs(field, name, held_out))
+            certificate[name] = field_errors(name, _pairs(field, name, held_out), sizes.get(name, 0.0))
     if all("displacement" in snapshot.sensitivities for snapshot in held_out):
         certificate["sensitivity"] = _sensitivity_errors(model, held_out)
     return certificate
@@ -253,8 +279,8 @@ def _unit(name: str) -> tuple[str, float]:
     return next(unit for start, unit in _UNITS.items() if name.startswith(start))
 
 
-def _tally(field: SeparatedField, name: str, held_out: list[Snapshot]) -> _ErrorTally:
-    tally = _ErrorTally(_norm_weights(name, field.modes.shape[2]))
+def _tally(field: SeparatedField, name: str, held_out: list[Snapshot], typical: float) -> _ErrorTally:
+    tally = _ErrorTally(_norm_weights(name, field.modes.shape[2]), typical)
     for predicted, truth in _pairs(field, name, held_out):
         tally.add(predicted, truth)
     return tally
@@ -265,8 +291,15 @@ def _pairs(field: SeparatedField, name: str, held_out: list[Snapshot]) -> Iterat
     return ((field.value(snapshot.coordinates), snapshot.fields[name]) for snapshot in held_out)
 
 
-def field_errors(name: str, pairs: Iterable[tuple[Array, Array]]) -> dict[str, Any]:
-    """Errors of one field as `certify` states them, from pairs of values (n, c), SI: those to judge, and the truth."""
+def field_errors(name: str, pairs: Iterable[tuple[Array, Array]], typical: float = 0.0) -> dict[str, Any]:
+    """Errors of one field as `certify` states them.
+
+    Parameters
+    ----------
+    name : of the field.
+    pairs : values (n, c), SI: those to judge, and the truth.
+    typical : root mean square of the field in the solution where it is largest (`typical_sizes`); 0 if unknown.
+    """
     tallies: dict[str, _ErrorTally] = {}
     for predicted, truth in pairs:
         kinds = {name: (predicted, truth, _norm_weights(name, truth.shape[1]))}
@@ -274,15 +307,17 @@ def field_errors(name: str, pairs: Iterable[tuple[Array, Array]]) -> dict[str, A
             ours, true = (von_mises(values.astype(np.float64))[:, None] for values in (predicted, truth))
             kinds["von_mises"] = (ours, true, np.ones(1))
         for kind, (ours, true, weights) in kinds.items():
-            tallies.setdefault(kind, _ErrorTally(weights)).add(ours, true)
+            tallies.setdefault(kind, _ErrorTally(weights, typical)).add(ours, true)
     figures = {kind: tally.figures(*_unit(name)) for kind, tally in tallies.items()}
     return figures.pop(name) | figures
 
 
-def _displacement_errors(model: ReducedModel, held_out: list[Snapshot], scattered: bool) -> dict[str, Any]:
+def _displacement_errors(
+    model: ReducedModel, held_out: list[Snapshot], scattered: bool, typical: float
+) -> dict[str, Any]:
     """The entries "displacement" and "held_out"."""
     field, name = model.displacement, "displacement"
-    tally = _tally(field, name, held_out)
+    tally = _tally(field, name, held_out, typical)
     coordinates = [snapshot.coordinates.tolist() for snapshot in held_out]
     figures = tally.figures(*_unit(name)) | {
         "mean_mm_by_modes": (1e3 * errors_by_modes(field, name, held_out)).tolist(),

@@ -23,7 +23,7 @@ from morph_dslam.model import ReducedModel, save_model
 from morph_dslam.model.stated_errors import doubtful_errors, doubtful_mesh_errors, errors_in_words
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.bisection import COARSER
-from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings
+from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings, typical_sizes
 from morph_dslam.reduction.registry import ReductionMethod, reduction_method
 from morph_dslam.reduction.self_penetration import obstacle_report, penetration_report
 from morph_dslam.reduction.task import ReductionTask
@@ -336,7 +336,8 @@ def certified_model(
     model, method = _reduced(task, method, fallback)
     announce(f"measuring errors at {len(held_out)} held-out solutions")
     # Nobody knows how another program's states lie in the box.
-    model.certificate.update(certify(model, held_out, scattered=snapshots.problem is not None))
+    sizes = typical_sizes(model, snapshots.coordinates)
+    model.certificate.update(certify(model, held_out, snapshots.problem is not None, sizes))
     model.certificate["compression_percent"] = compression_percent(model, len(training) + len(held_out))
     model.certificate["samples"] = _samples(snapshots)
     if method.adaptive:

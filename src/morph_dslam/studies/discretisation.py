@@ -30,7 +30,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.parameter_errors import ENTRY, parameter_errors
 from morph_dslam.model.reduced_model import REACTION
 from morph_dslam.model.stated_errors import ESTIMABLE, NOT_ESTIMATED
-from morph_dslam.reduction.certificate import field_errors
+from morph_dslam.reduction.certificate import field_errors, typical_sizes
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.higher_order import HigherOrder, OutOfTime
 from morph_dslam.studies.problem import Snapshot, announce
@@ -391,14 +391,15 @@ def _figures(
         for index, finer_snapshot in sorted(solved.items())
     ]
     shapes = [(own.coordinates, own.fields["displacement"], truth.fields["displacement"]) for own, truth in pairs]
-    known = [_regular_nodes(truth) for _, truth in pairs]
+    known, sizes = [_regular_nodes(truth) for _, truth in pairs], typical_sizes(model, snapshots.coordinates)
     if min(mask.mean() for mask in known) < FEWEST_REGULAR:
         raise _NotEstimated(f"the finer solution has no stress at {max((~mask).sum() for mask in known)} nodes")
 
     def errors(name: str) -> dict[str, Any]:
         values = [(own.fields[name], truth.fields[name]) for own, truth in pairs]
-        nodal = name in NODAL
-        return field_errors(name, [(a[k], b[k]) if nodal else (a, b) for (a, b), k in zip(values, known, strict=True)])
+        if name in NODAL:
+            values = [(a[k], b[k]) for (a, b), k in zip(values, known, strict=True)]
+        return field_errors(name, values, sizes[name])
 
     return {
         "method": f"displacements of order {finer.displacements.order} on the same cells",

@@ -61,6 +61,11 @@ class Snapshots:
     stability: dict[str, Any] | None = None
     rounds: list[dict[str, Any]] = field(default_factory=list)
 
+    @property
+    def coordinates(self) -> list[Array]:
+        """Parameters (d,) of all solutions, SI."""
+        return [each.coordinates for group in [*self.training, self.held_out] for each in group]
+
 
 def take_snapshots(
     study: Study, folder: Path, workers: int | None = None, executor: Executor | None = None
