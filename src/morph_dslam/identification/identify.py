@@ -8,7 +8,7 @@ scatters, and normal for the rest.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -21,9 +21,10 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.doubts import check_size
 from morph_dslam.identification.measured_forces import MeasuredForces
-from morph_dslam.identification.measurements import Measurement
+from morph_dslam.identification.measurements import Measurement, Unknowns
 from morph_dslam.identification.prior import KnownValues
 from morph_dslam.identification.scatter import Design, Noise, Scatter, directions
+from morph_dslam.identification.values import FACTOR as FACTOR, Values
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.flat_sides import LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
     from morph_dslam.identification.given_loads import GivenLoads
 
 Array = NDArray[np.float64]
-#: Range of the common factor of all moduli, and its name among the unknowns.
-FACTOR, FACTOR_RANGE = "moduli_factor", (0.01, 100.0)
+#: Range of the common factor of all moduli.
+FACTOR_RANGE = (0.01, 100.0)
 #: Starts of the search, so that it does not end in a local minimum (a power of two); most rounds of weighting, which
 #: end when no noise changes by more than this share.
 STARTS, ROUNDS, SETTLED = 8, 12, 0.01
@@ -88,6 +89,7 @@ class Misfit:
     slopes : (n, f) derivatives by the unknowns that are not at an end of their range.
     model_rms : root mean square of the model's own errors of the predictions.
     by_range : (k,) root mean square of what each unknown changes the predictions by over its whole range.
+    at : the values with which they were predicted.
     """
 
     measurement: Measurement
@@ -96,6 +98,7 @@ class Misfit:
     slopes: Array
     model_rms: float
     by_range: Array
+    at: Unknowns
 
     @property
     def missed(self) -> Array:
@@ -165,43 +168,6 @@ class _Spread:
     def half(self) -> Array:
         """Half the width (k,) of 95 % intervals."""
         return np.sqrt(self.scatter.half**2 + float(norm.ppf(0.975)) ** 2 * np.diag(self.known + self.model))
-
-
-class _Values:
-    """Values of the unknowns, as measurements take them.
-
-    Parameters
-    ----------
-    model : whose parameters they are.
-    unknowns : all of them, and their values ``theta`` (k,), SI.
-    scaled : names of the parameters that a factor of all moduli divides.
-
-    Attributes
-    ----------
-    beyond : values, SI, of parameters that such a division has taken out of their ranges, by name.
-    """
-
-    def __init__(
-        self, model: ReducedModel, unknowns: Sequence[Parameter], theta: Array, scaled: Collection[str] = ()
-    ) -> None:
-        self._model, self._scaled = model, scaled
-        self._own = {p.name: float(value) for p, value in zip(unknowns, theta, strict=True)}
-        self.factor = self._own.pop(FACTOR, 1.0)
-        self.beyond: dict[str, list[float]] = {}
-
-    def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
-        mu = self._model.vector({**known, **self._own})
-        for k, parameter in enumerate(self._model.parameters):
-            name = parameter.name
-            if name in self._scaled and not (shown and name in known and name not in self._own):
-                mu[k] /= self.factor
-                if not parameter.in_range(mu[k]):
-                    self.beyond.setdefault(name, []).append(float(mu[k]))
-        return mu
-
-    def shown(self, names: Sequence[str]) -> Array:
-        """Those unknowns (m,) as pictures show them, in which loads are those of the model."""
-        return np.array([self._own[name] / (self.factor if name in self._scaled else 1.0) for name in names])
 
 
 def identify(
@@ -318,8 +284,8 @@ class _Fit:
         # An interval may be wider than numbers reach.
         return np.where(self._log, np.exp(np.where(self._log, np.clip(inner, -LARGEST, LARGEST), 0.0)), inner)
 
-    def _values(self, theta: Array) -> _Values:
-        return _Values(self._model, self._unknowns, self._si(theta), self._scaled)
+    def _values(self, theta: Array) -> Values:
+        return Values(self._model, self._unknowns, self._si(theta), self._scaled)
 
     def _predictions(self, theta: Array) -> list[tuple[Array, Array]]:
         """Of each measurement, (n,) without and with what is not known of the measurement itself."""
@@ -472,7 +438,15 @@ class _Fit:
             size = root_mean_square(np.linalg.norm(errors[:, rows], axis=0))
             of_model = noise * size
             found.append(
-                Misfit(measurement, predicted, predicted - raw, noise * slopes[rows], of_model, by_range[:, at])
+                Misfit(
+                    measurement,
+                    predicted,
+                    predicted - raw,
+                    noise * slopes[rows],
+                    of_model,
+                    by_range[:, at],
+                    self._values(theta),
+                )
             )
             begin = rows.stop
         return tuple(found)

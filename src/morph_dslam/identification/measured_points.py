@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
-from morph_dslam.geometry import fit_similarity
+from morph_dslam.geometry import SimilarityTransform, fit_similarity
 from morph_dslam.identification.measurements import Unknowns
 from morph_dslam.identification.model_error import shape_errors
 from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
@@ -28,6 +28,8 @@ PLACE, MEASURED = ("place_x", "place_y", "place_z"), ("x", "y", "z")
 OWN = (STATE, *PLACE, *MEASURED)
 #: Points farther off the undeformed surface than this share of the object's size are a mistake.
 FARTHEST = 0.25
+#: Step of a difference, of a parameter's range.
+STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,11 @@ class MeasuredPoints:
     def adjusted(self, predicted: Array) -> Array:
         if not self.aligned:
             return predicted
-        motion = fit_similarity(predicted.reshape(-1, 3), self.measured, with_scale=False)
-        return motion.apply(predicted.reshape(-1, 3)).ravel()
+        return self._motion(predicted).apply(predicted.reshape(-1, 3)).ravel()
+
+    def _motion(self, predicted: Array) -> SimilarityTransform:
+        """That moves predictions (n,) of all coordinates to the measured ones."""
+        return fit_similarity(predicted.reshape(-1, 3), self.measured, with_scale=False)
 
     def loose(self, predicted: Array) -> Array:
         if not self.aligned:
@@ -126,11 +131,35 @@ class MeasuredPoints:
         arms = points - points.mean(axis=0)
         # By their size turns count like shifts, and those about the line of points that lie in one are none.
         arms /= max(float(np.abs(arms).max()), np.finfo(float).tiny)
-        turns = np.cross(np.eye(3)[:, None], arms).reshape(3, -1)
+        turns = np.asarray(np.cross(np.eye(3)[:, None], arms), dtype=np.float64).reshape(3, -1)
         return np.vstack([np.tile(np.eye(3), (1, len(points))), turns]).T
 
     def model_errors(self, unknowns: Unknowns) -> Array:
         return shape_errors(self.model, self.positions, unknowns.vector)[:, self._present]
+
+    @property
+    def given_values(self) -> Array:
+        """Of each known parameter, its values (p, n) where coordinates were measured, over its range."""
+        parameters = {p.name: p for p in self.model.parameters}
+        shares = [
+            (self.known[n] - parameters[n].lower) / (parameters[n].upper - parameters[n].lower) for n in self.known
+        ]
+        repeated = [np.repeat(share[:, None], 3, axis=1)[self._present] for share in shares]
+        return np.array(repeated, dtype=np.float64)
+
+    def slopes_by_given(self, unknowns: Unknowns) -> Array:
+        """Derivatives (n, p) of adjusted predictions by the known parameters, each over its range."""
+        motion = self._motion(self.predict(unknowns)).rotation if self.aligned else np.eye(3)
+        columns = []
+        for parameter in (p for p in self.model.parameters if p.name in self.known):
+            step = STEP * (parameter.upper - parameter.lower)
+            values = self.known[parameter.name]
+            ends = [np.clip(values + sign * step, parameter.lower, parameter.upper) for sign in (-1.0, 1.0)]
+            below, above = (replace(self, known={**self.known, parameter.name: end}) for end in ends)
+            change = above.positions(unknowns.vector) - below.positions(unknowns.vector)
+            way = (ends[1] - ends[0])[:, None] / (parameter.upper - parameter.lower)
+            columns.append((change / way @ motion.T)[self._present])
+        return np.column_stack(columns) if columns else np.zeros((len(self.values), 0))
 
     def positions(self, vector: Callable[[Mapping[str, float]], Array]) -> Array:
         """Where the model has the points (r, 3), m; ``vector`` makes its parameters (d,) of the known ones."""

@@ -20,6 +20,7 @@ from morph_dslam.identification.identify import FACTOR, Estimate, Identification
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.missed_states import missed_state_notes, state_figures
+from morph_dslam.identification.moved_states import moved_state_notes, moved_states
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter
@@ -94,9 +95,16 @@ def _misfit_figures(misfit: Misfit, found: Identification) -> dict[str, Any]:
         return figures | _force_figures(misfit, measurement, identified, found.size_factor(measurement))
     if isinstance(measurement, MeasuredPoints):
         figures |= {"span_of_object": measurement.span, "states": state_figures(misfit, measurement)}
-        moved = np.sqrt(3.0) * scale * root_mean_square(misfit.adjustment)
-        return figures | ({"moved_rms": moved} if measurement.aligned else {})
+        return figures | (_motion_figures(misfit, measurement) if measurement.aligned else {})
     return figures
+
+
+def _motion_figures(misfit: Misfit, points: MeasuredPoints) -> dict[str, Any]:
+    """Those of points that were aligned."""
+    found = moved_states(misfit, points)
+    states = None if found is None else {"rms": points.scale * found.rms, "with_load": found.with_load}
+    moved = np.sqrt(3.0) * points.scale * root_mean_square(misfit.adjustment)
+    return {"moved_rms": moved, "states_moved": states}
 
 
 def _force_figures(
@@ -126,12 +134,15 @@ def _force_figures(
 MOST_MISSED, LEAST_SPAN = 0.25, 0.05
 #: Estimates that are more correlated than this, either way, are named.
 CORRELATED = 0.95
+#: Estimates that are less correlated than this hardly depend on each other.
+RELATED = 0.1
 
 
 def identification_lines(figures: Mapping[str, Any]) -> list[str]:
     """What was identified, and what a reader must know of it."""
     measured = figures["measurements"]
     said = [line for each in figures["parameters"] for line in _parameter_lines(each, measured)]
+    said += _held_by_ends(figures)
     names = list(figures["correlation"])
     for i, a in enumerate(names):
         for b in names[i + 1 :]:
@@ -147,6 +158,19 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
         )
     said += [*_given_loads(figures.get("loads")), *_model_errors(figures), *_at_default(measured, FACTOR in names)]
     return said + [line for each in measured for line in _measurement_lines(each)]
+
+
+def _held_by_ends(figures: Mapping[str, Any]) -> list[str]:
+    """Which intervals do not hold because another parameter is at the end of its range."""
+    said, at_end = [], {each["name"]: each["at_bound"] for each in figures["parameters"]}
+    for end in (name for name, is_at_end in at_end.items() if is_at_end):
+        row = figures["correlation"][end]
+        if moved := [name for name in at_end if not at_end[name] and abs(row[name]) > RELATED]:
+            said.append(
+                f"note: {' and '.join(moved)} made good what {end}, at the end of its range, could not: "
+                f"{'its interval does' if len(moved) == 1 else 'their intervals do'} not hold"
+            )
+    return said
 
 
 def _given_loads(loads: Mapping[str, Any] | None) -> list[str]:
@@ -252,6 +276,7 @@ def _doubts(each: Mapping[str, Any]) -> list[str]:
             f"missed: check the units, and {check}"
         )
     said += missed_state_notes(each)
+    said += moved_state_notes(each)
     span, share = each.get("span_of_object"), each.get("share_of_range")
     if span is not None and span < LEAST_SPAN:
         said.append(
