@@ -13,6 +13,7 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam.cli import app as cli
+from morph_dslam.errors import SolverError
 from morph_dslam.evaluation.model_summary import error_facts, summarise_model
 from morph_dslam.mechanics.solid import SolidOptions
 from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
@@ -285,6 +286,44 @@ def test_finer_elements_start_from_the_pressures_of_rubber(cells: str, width: st
         for problem, dofs in ((coarse, given), (finer, found), (finer, loaded_state(finer, mu).dofs))
     )
     assert np.abs(again - truth).max() < 0.05 * np.abs(own - truth).max()
+
+
+def pressed_and_sheared() -> SolidStudy:
+    """A soft block whose cells are sheared so much that finer displacements invert them at the nodes."""
+    content = {
+        "name": "sheared",
+        "mesh": {"generator": "block", "size": ["20 mm"] * 3, "divisions": [3, 3, 2], "cells": "hex8"},
+        "materials": {"soft": {"law": "neo_hookean", "young": "60 kPa", "poisson": 0.45}},
+        "supports": [
+            {"kind": "fixed", "on": "z_min"},
+            {"kind": "displacement", "on": "z_max", "x": "push", "y": "0 mm", "z": "-1 * push"},
+        ],
+        "parameters": {"push": {"range": ["0 mm", "12 mm"]}},
+    }
+    study = md.make_study(content)
+    assert isinstance(study, SolidStudy)
+    return study
+
+
+def test_finer_elements_that_the_study_s_solution_inverts_are_loaded_from_rest() -> None:
+    """Against the finer solution in small increments."""
+    study, mu = pressed_and_sheared(), np.array([12e-3])
+    coarse, finer = study.problem(), study.problem(SolidOptions(order=2, serendipity=True, at_nodes=True))
+    given = loaded_state(coarse, mu).dofs
+    found = finer.nodal_displacement(HigherOrder(coarse, finer).solve(given, mu).dofs)
+    small_steps = np.linspace(0.0, mu, 13)[1:]
+    truth = finer.nodal_displacement(advance(finer, loaded_state(finer, np.zeros(1)), small_steps)[-1].dofs)
+    assert np.abs(found - truth).max() < 0.05 * np.abs(coarse.nodal_displacement(given) - truth).max()
+
+
+def test_a_state_that_loads_from_rest_do_not_lead_to_has_no_finer_one_from_rest() -> None:
+    """It may be another branch, whose distance would pass for an error of the elements."""
+    study, mu = pressed_and_sheared(), np.array([12e-3])
+    coarse, finer = study.problem(), study.problem(SolidOptions(order=2, serendipity=True, at_nodes=True))
+    given = loaded_state(coarse, mu).dofs
+    elsewhere = given + np.where(coarse.free, 4e-3, 0.0)
+    with pytest.raises(SolverError, match=r"at push = 12 mm.* lead to another equilibrium"):
+        HigherOrder(coarse, finer).solve(elsewhere, mu)
 
 
 def test_a_finer_solution_on_another_branch_is_left_out(

@@ -207,7 +207,7 @@ def _solved_again(
 
     Raises _NotEstimated where all are missing.
     """
-    solved, late, failed = dict[int, Snapshot](), 0, ""
+    solved, late, failed = dict[int, Snapshot](), 0, list[str]()
     begin = time.thread_time()
     for number, index in enumerate(chosen):
         now = time.thread_time()
@@ -217,9 +217,11 @@ def _solved_again(
         except OutOfTime:
             late += 1
         except SolverError as error:
-            failed = f"one was left out: {error}"
+            failed.append(str(error))
+    # The first reason stands for all: every run with the model repeats it.
+    missing = f"{len(failed)} of {len(chosen)} states were left out: {failed[0]}" if failed else ""
     slow = f"{late} of {len(chosen)} states would take more than {_LIMIT}: {_ASK}" if late else ""
-    left_out = "; ".join(filter(None, (failed, slow)))
+    left_out = "; ".join(filter(None, (missing, slow)))
     if not solved:
         raise _NotEstimated(left_out)
     return solved, {"left_out": left_out} if left_out else {}

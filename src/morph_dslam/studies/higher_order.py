@@ -13,7 +13,7 @@ from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.mechanics.solvers import newton
 from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.solvers.linear_solver import SolverMaker
-from morph_dslam.mechanics.solvers.newton import Linearisation, State, size, solve
+from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, size, solve
 from morph_dslam.mechanics.solvers.two_level import LowerOrder, TwoLevelSolver
 
 Array = NDArray[np.float64]
@@ -45,7 +45,9 @@ class HigherOrder:
         held: as finer displacements this one is strained far too much in bending, and Newton's method would take long
         from it. Elements with pressures do not lock, so that all unknowns may be solved for at once; held displacements
         leave cells of them large bubbles alone to keep their volume at more points. Where neither converges, the forces
-        that the start lacks for balance fade away in increments, so that the solution is on the same branch.
+        that the start lacks for balance fade away in increments, so that the solution is on the same branch. A start
+        that is turned inside out between the points at which the coarse elements are evaluated has no such forces: then
+        all loads grow from rest.
 
         Raises
         ------
@@ -69,7 +71,28 @@ class HigherOrder:
             except SolverError:
                 if is_held and self.iterative:
                     raise  # a path would take as long as many states
-        return loaded_state(equations, mu, start.dofs, PART * TOLERANCE)
+        try:
+            return loaded_state(equations, mu, start.dofs, PART * TOLERANCE)
+        except SolverError:
+            return self._from_rest(equations, dofs, mu)
+
+    def _from_rest(self, equations: Equations, dofs: Array, mu: Array) -> State:
+        """The solution at ``mu`` (d,) that loads lead to which grow from rest, if they lead to ``dofs`` (n,) too.
+
+        Otherwise it may be another branch than that of the coarse solution.
+        """
+        place = newton.where(self.problem, mu)
+        try:
+            own = loaded_state(self._coarse, mu)
+            found = loaded_state(equations, mu, tolerance=PART * TOLERANCE)
+        except SolverError as error:
+            raise SolverError(f"finer elements do not converge at {place}") from error
+        if size(self._coarse, own.dofs - dofs) > PART * TOLERANCE:
+            raise SolverError(
+                f"finer elements do not converge at {place} from the study's solution, and loads that grow from rest "
+                "lead to another equilibrium"
+            )
+        return found
 
     @cached_property
     def _kept(self) -> NDArray[np.bool_]:
