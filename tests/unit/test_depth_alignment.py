@@ -1,5 +1,7 @@
 """A depth image that does not belong to the colour image's pixels is named, and one that does is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,16 +23,21 @@ BENT = State(np.array([0.04, 0.2, 0.1]), POSE)
 BEHIND, BEFORE = 1.5, 0.4
 
 
-def registered(seed, shift_px, landmark_px=0.5, count=16, covered=0.0):
-    """Landmarks, and a depth image whose columns are shifted, with something before this share of its width."""
+def registered(seed, shift_px, landmark_px=0.5, count=16, covered=0.0, scale=1.0, turned=0.0):
+    """Landmarks, and a depth image whose columns are shifted, with something before this share of its width.
+
+    All its depths are too large by the factor ``scale``, and the sheet had turned by ``turned``, rad, when it was taken.
+    """
     rng = np.random.default_rng(seed)
     rows = rng.choice(len(MODEL.nodes), count, replace=False)
     pixels = CAMERA.project(POSE.apply(MODEL.positions(BENT.parameters)[rows]))
     landmarks = Landmarks(MODEL.nodes[rows], pixels + landmark_px * rng.standard_normal(pixels.shape))
-    depth = np.roll(sheet_depth(MODEL, BENT, rng, background=BEHIND), shift_px, axis=1)
+    rotation = POSE.rotation @ rotation_exp(np.array([0.0, turned, 0.0]))
+    then = replace(BENT, camera_from_object=RigidTransform(rotation, POSE.translation))
+    depth = np.roll(sheet_depth(MODEL, then, rng, background=BEHIND), shift_px, axis=1)
     left, right = np.flatnonzero((depth < 0.5 * BEHIND).any(axis=0))[[0, -1]]
     depth[:, left : left + int(covered * (right - left))] = BEFORE
-    return register_landmarks(MODEL, CAMERA, landmarks, depth=depth)
+    return register_landmarks(MODEL, CAMERA, landmarks, depth=np.float32(scale) * depth)
 
 
 def kinds(registration):
@@ -40,11 +47,21 @@ def kinds(registration):
 
 def test_depth_that_is_shifted_is_named_and_not_the_landmarks():
     found = registered(0, 25)
+    assert kinds(found) & {DepthAgainstLandmarks, DepthBehindObject}
+    assert PoorFit not in kinds(found)
+    assert all(
+        "not aligned" in w.text for w in found.warnings if isinstance(w, DepthAgainstLandmarks | DepthBehindObject)
+    )
+
+
+@pytest.mark.parametrize("seed", range(1, 3))
+def test_depth_of_another_instant_is_named_and_not_the_landmarks(seed):
+    """The object was turned by some degrees since: no scale of the depths makes landmarks fit."""
+    found = registered(seed, 0, turned=0.06)
     assert kinds(found) == {DepthAgainstLandmarks}
     (said,) = (w for w in found.warnings if isinstance(w, DepthAgainstLandmarks))
     assert said.alone_px == pytest.approx(0.5, rel=0.5)
-    assert said.with_depth_px > 2.0 * said.alone_px
-    assert "not aligned" in said.text
+    assert said.with_depth_px > 1.5 * said.alone_px
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -80,3 +97,13 @@ def test_what_is_before_the_object_is_not_taken_for_depth_that_is_shifted(seed):
     found = registered(seed, 0, covered=0.3)
     assert kinds(found) == set()
     assert mean_error(MODEL, found.state, BENT) < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_depths_that_are_too_large_by_their_deviation_do_not_contradict_the_landmarks(seed):
+    """Ten landmarks fit more than twice as badly with them, six millimetres off: the deviations contain that."""
+    found = registered(seed, 0, count=10, scale=1.01)
+    assert kinds(found) == set()
+    away = found.state.camera_from_object.translation - POSE.translation
+    assert abs(away[2]) == pytest.approx(0.01 * POSE.translation[2], rel=0.3)
+    assert (np.abs(away) < 2.0 * np.sqrt(np.diag(found.covariance)[-3:])).all()

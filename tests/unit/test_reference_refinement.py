@@ -111,7 +111,7 @@ def test_depth_places_the_object_along_the_sight_line():
     for seed in range(4):
         landmarks, pixels, start = by_landmarks(seed)
         image = sheet_depth(MODEL, TRUTH, np.random.default_rng(seed))
-        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image)
+        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image).estimate
         before.append(along_the_sight_line(start.state))
         after.append(along_the_sight_line(found.state))
         # Along the sight line all depths may be off by one factor, which the landmarks know no better.
@@ -126,7 +126,9 @@ def test_depths_that_are_all_off_by_one_percent_place_it_one_deviation_off(facto
     landmarks, pixels, start = by_landmarks(0)
     image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0))
     right, wrong = (
-        refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, np.float32(scale) * image)
+        refine_by_depth(
+            Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, np.float32(scale) * image
+        ).estimate
         for scale in (1.0, factor)
     )
     distance = right.state.camera_from_object.translation[2]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, check_kind
@@ -45,9 +46,10 @@ from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M
-from morph_dslam.tracking.depth_registration import refine_by_depth, share_behind
+from morph_dslam.tracking.depth_registration import FoundByDepth, refine_by_depth, share_behind
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.rig import RigCamera
+from morph_dslam.tracking.state import moved as at_step
 
 Array = NDArray[np.float64]
 #: Standard deviation of a carefully set landmark, pixels.
@@ -56,6 +58,8 @@ CLICK_PX = 0.5
 UNKNOWN_PX = 2.0
 #: With fewer numbers to spare, residuals show the error of landmarks to a third at best.
 ENOUGH_SPARE = 6
+#: Landmarks fit so much better without depth that is right with this chance at most.
+DEPTH_CHANCE = 1e-4
 #: More of the depths on an object than this share do not lie behind it, if they belong to its pixels.
 SEEN_THROUGH = 0.05
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
@@ -161,6 +165,8 @@ class _Placed:
     facts : on that too.
     is_corrected : whether something beside landmarks decided.
     behind : share of the depths on it that lie behind it.
+    left : share of the landmarks' residuals that is left where the scale of the depths suits them best, as far as it
+        is known; 1 without depth.
     """
 
     estimate: Estimate
@@ -171,6 +177,7 @@ class _Placed:
     facts: dict[str, Any] = field(default_factory=dict)
     is_corrected: bool = False
     behind: float = 0.0
+    left: float = 1.0
 
 
 def _precise(fit: LandmarkFit) -> Estimator:
@@ -192,10 +199,24 @@ def _by_depth(
     sigma = max(fit.best.sigma_px, LEAST_PX) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
     landmarks = fit.landmarks
     precise = _precise(fit)
-    best = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, *deviations)
+    found = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, *deviations)
+    best = found.estimate
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
     facts, behind = {"along_the_sight_line": "by depth"}, share_behind(precise, best.state, depth, deviations[0])
-    return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind)
+    return _Placed(best, covariance, None, alternatives, (), facts, True, behind, _left_at_best_scale(fit, found))
+
+
+def _left_at_best_scale(fit: LandmarkFit, found: FoundByDepth) -> float:
+    """Share of the landmarks' residuals that is left where the scale of the depths suits these best, as known as it is.
+
+    What depths of another scale leave does not contradict the landmarks: the covariance contains it.
+    """
+    state, points = found.estimate.state, fit.landmarks.points
+    there, here = (fit.estimator.pixels(points, at) for at in (at_step(state, found.by_scale), state))
+    along, residuals = (there - here).ravel(), found.estimate.residuals.ravel()
+    squares, variance = float(residuals @ residuals), max(fit.click_px, np.nan_to_num(fit.best.sigma_px)) ** 2
+    taken = float(along @ residuals) ** 2 / (float(along @ along) + variance)
+    return float(np.sqrt(max(1.0 - taken / max(squares, 1e-30), 0.0)))
 
 
 def _by_outline(fit: LandmarkFit, placed: _Placed, grey: NDArray[np.uint8]) -> _Placed:
@@ -245,7 +266,7 @@ def _warnings(
     contradiction = cameras_contradict(fit.estimator, bound, pixels, fit.best, fit.click_px)
     if contradiction is not None:
         found.append(contradiction)
-    fits = _of_residuals(fit, best, moved, is_by_depth)
+    fits = _of_residuals(fit, best, moved, placed.left if is_by_depth else None)
     if fits is not None and not (isinstance(fits, PoorFit) and contradiction is not None):
         found.append(fits)
     # Landmarks take up most of a depth that is shifted: that they fit says little.
@@ -265,19 +286,27 @@ def _warnings(
 
 
 def _of_residuals(
-    fit: LandmarkFit, best: Estimate, moved: NotAtRest | None, is_by_depth: bool
+    fit: LandmarkFit, best: Estimate, moved: NotAtRest | None, left: float | None
 ) -> RegistrationWarning | None:
-    """What the residuals of the best estimate, or too few landmarks, say."""
+    """What the residuals of the best estimate, or too few landmarks, say.
+
+    ``left`` is the share of residuals beside what the scale of depths explains; None without depth.
+    """
     numbers, unknowns, click_px = 2 * len(fit.landmarks), len(fit.estimator.model.parameters) + 6, fit.click_px
-    alone_px = fit.best.sigma_px
+    alone_px, left_px = fit.best.sigma_px, best.sigma_px * (1.0 if left is None else left)
     if numbers <= unknowns:
         return Underdetermined(numbers, unknowns, unknowns // 2 + 3)
     if moved is not None:
         return moved
-    if is_by_depth and np.isfinite(alone_px) and best.sigma_px > max(fit.poor_px, POOR_FIT * max(alone_px, click_px)):
-        return DepthAgainstLandmarks(alone_px, best.sigma_px)
-    if best.sigma_px > fit.poor_px:
-        return PoorFit(best.sigma_px, click_px)
+    if left is not None and np.isfinite(alone_px):
+        squares, by_depth = (float(np.sum(residuals**2)) for residuals in (fit.best.residuals, left * best.residuals))
+        # Depth that is right moves the unknowns by no more than the landmarks' errors: F of all of them.
+        ratio = (by_depth - squares) / (unknowns * max(squares / (numbers - unknowns), click_px**2))
+        is_unlikely = fdtrc(unknowns, numbers - unknowns, max(ratio, 0.0)) < DEPTH_CHANCE
+        if is_unlikely or left_px > max(fit.poor_px, POOR_FIT * max(alone_px, click_px)):
+            return DepthAgainstLandmarks(alone_px, left_px)
+    if left_px > fit.poor_px:
+        return PoorFit(left_px, click_px)
     if numbers - unknowns < ENOUGH_SPARE:
         enough = -(-(unknowns + ENOUGH_SPARE) // 2)
         return FewLandmarks(len(fit.landmarks), max(best.sigma_px, click_px), enough)

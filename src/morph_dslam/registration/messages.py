@@ -128,7 +128,7 @@ class DepthAgainstLandmarks(RegistrationWarning):
     Attributes
     ----------
     alone_px : standard deviation of their pixels by the fit without depth.
-    with_depth_px : the same with it.
+    with_depth_px : the same with it, beside what the scale of the depths explains.
     """
 
     template: ClassVar[str] = (

@@ -7,7 +7,7 @@ those of one material point, as of points whose pixels are measured, a sheet tur
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,6 +35,21 @@ LARGEST_DISTANCE = 0.05
 RIM_PX = 4
 
 
+@dataclass(frozen=True)
+class FoundByDepth:
+    """An object's state by depth.
+
+    Attributes
+    ----------
+    estimate : its covariance contains that all depths may be too large by one factor, which no residual of depths
+        shows.
+    by_scale : (d + 6,) by which one standard deviation of that factor moves it.
+    """
+
+    estimate: Estimate
+    by_scale: Array
+
+
 def refine_by_depth(
     estimator: Estimator,
     landmarks: BoundPoints,
@@ -44,10 +59,8 @@ def refine_by_depth(
     image: NDArray[np.float32],
     sigma_at_1m: float = SIGMA_AT_1M,
     scale_std: float = SCALE_STD,
-) -> Estimate:
+) -> FoundByDepth:
     """The state of an object from landmarks and a depth image of the same view.
-
-    Its covariance contains that all depths may be too large by one factor, which no residual of depths shows.
 
     Parameters
     ----------
@@ -82,7 +95,8 @@ def refine_by_depth(
     assert found is not None
     estimate = estimator.finished(found, np.ones(len(pixels)), np.full(len(pixels), 2))
     moved_by = scale_std * by_scale
-    return replace(estimate, covariance=estimate.covariance + np.outer(moved_by, moved_by))
+    estimate = replace(estimate, covariance=estimate.covariance + np.outer(moved_by, moved_by))
+    return FoundByDepth(estimate, moved_by)
 
 
 class _DepthFit:
