@@ -26,7 +26,7 @@ BEHIND, BEFORE = 1.5, 0.4
 def registered(seed, shift_px, landmark_px=0.5, count=16, covered=0.0, scale=1.0, turned=0.0):
     """Landmarks, and a depth image whose columns are shifted, with something before this share of its width.
 
-    All its depths are too large by the factor ``scale``, and the sheet had turned by ``turned``, rad, when it was taken.
+    All its depths are too large by the factor ``scale``; the sheet had turned by ``turned``, rad, when it was taken.
     """
     rng = np.random.default_rng(seed)
     rows = rng.choice(len(MODEL.nodes), count, replace=False)
