@@ -40,6 +40,21 @@ def registered(seed, shift_px, landmark_px=0.5, count=16, covered=0.0, scale=1.0
     return register_landmarks(MODEL, CAMERA, landmarks, depth=np.float32(scale) * depth)
 
 
+@pytest.mark.parametrize("scale", [0.976, 1.024])
+def test_depth_of_another_scale_is_taken_where_the_object_is_far_for_its_size(scale):
+    """All depths are off by more than a twentieth of the object's size; what they say is stated with their scale."""
+    rng, far = np.random.default_rng(0), RigidTransform(POSE.rotation, np.array([0.0, 0.0, 1.3]))
+    state = State(BENT.parameters, far)
+    rows = rng.choice(len(MODEL.nodes), 16, replace=False)
+    pixels = CAMERA.project(far.apply(MODEL.positions(state.parameters)[rows])) + 0.3 * rng.standard_normal((16, 2))
+    depth = np.float32(scale) * sheet_depth(MODEL, state, rng, background=2.5)
+    found = register_landmarks(MODEL, CAMERA, Landmarks(MODEL.nodes[rows], pixels), depth=depth)
+    away = found.state.camera_from_object.translation[2] - 1.3
+    assert 0.0 < away / (scale - 1.0) < 1.3 + 0.1  # landmarks know the distance too
+    assert abs(away) < 3.0 * np.sqrt(found.covariance[-1, -1])
+    assert not kinds(found)
+
+
 def kinds(registration):
     named = {DepthAgainstLandmarks, DepthBehindObject, PoorFit}
     return {type(warning) for warning in registration.warnings} & named

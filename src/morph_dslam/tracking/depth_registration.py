@@ -31,6 +31,8 @@ POINTS, ROUNDS, LEAST = 600, 3, 30
 STEP = 1e-2
 #: Depths farther from the surface than this share of the object's size are of something else.
 LARGEST_DISTANCE = 0.05
+#: Beside that they may be off by what this many deviations of their scale make.
+SCALE_SIGMAS = 3.0
 #: Depth within this many pixels of the object's rim may belong to what is behind it.
 RIM_PX = 4
 
@@ -78,8 +80,10 @@ def refine_by_depth(
         If there is hardly any depth where the landmarks have the object.
     """
     found, by_scale = None, np.zeros(0)
-    for _ in range(ROUNDS):
-        points, places, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m)
+    for number in range(ROUNDS):
+        # At first all of them may be off together, by what the scale of the depth camera may be.
+        off = 0.0 if number else SCALE_SIGMAS * scale_std
+        points, places, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m, off)
         depths = measured.only(near)
         if depths.count < LEAST:
             ratio = measured.ratio_to(points.in_camera(state)[:, 2])
@@ -201,17 +205,18 @@ def _term(estimator: Estimator, state: State, points: BoundPoints, places: Array
 
 
 def _depths_in_view(
-    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float
+    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float, off: float = 0.0
 ) -> tuple[BoundPoints, Array, PointDepths, NDArray[np.bool_]]:
     """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near it.
 
-    Depths have weights in standard deviations.
+    Depths have weights in standard deviations. Those are near it too that are ``off`` by this share of the distance.
     """
     points, places = _surface_in_view(estimator, state)
     seen = np.ones(len(points), dtype=bool)
     depths = PointDepths.sampled(image, places, seen, estimator.camera, 1.0, sigma_at_1m)
     size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
-    near = np.abs(depths.depths - points.in_camera(state)[:, 2]) < LARGEST_DISTANCE * size
+    distances = points.in_camera(state)[:, 2]
+    near = np.abs(depths.depths - distances) < LARGEST_DISTANCE * size + off * distances
     return points, places, depths, near
 
 
