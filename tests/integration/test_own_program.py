@@ -4,25 +4,12 @@ import numpy as np
 import pytest
 
 import morph_dslam as md
-from morph_dslam.camera import Camera
-from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import save_rig
-from morph_dslam.tracking.rig import RigCamera
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import samples
-from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state, write_landmarks, write_recording
+from tests.support.rendered_sequence import CAMERA, RIG, SheetFilm, sheet_state, write_landmarks, write_recording
 
 STEP = 0.02
-
-
-#: Half a metre apart and turned towards each other.
-RIG = (
-    RigCamera(Camera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity()),
-    RigCamera(
-        Camera(480, 360, 350.0, 350.0, 235.0, 182.0),
-        RigidTransform(rotation_exp(np.array([0.0, 0.5, 0.0])), np.array([-0.297, 0.0, 0.076])),
-    ),
-)
 
 
 def hand(column):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import morph_dslam as md
-from morph_dslam.camera import Camera
 from morph_dslam.cli.app import main
 from morph_dslam.errors import ArgumentError, RegistrationError, SourceError
 from morph_dslam.evaluation.run_folder import load_run
@@ -29,7 +28,11 @@ from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import (
+    ASIDE,
     CAMERA,
+    FRONT,
+    RIG,
+    TURN,
     UPRIGHT,
     SheetFilm,
     mean_error,
@@ -226,15 +229,8 @@ def test_an_object_in_the_place_of_another_one_is_named_as_such(two_sheets, tmp_
     )
 
 
-# Several cameras of wide lenses, so that one by itself tells little along its sight line; 0.4 m apart.
+# Several cameras.
 
-FRONT = RigCamera(Camera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity())
-TURN = rotation_exp(np.array([0.0, 0.5, 0.0]))
-ASIDE = RigCamera(
-    Camera(480, 360, 350.0, 350.0, 235.0, 182.0),
-    RigidTransform(TURN, np.array([0.0, 0.0, 0.62]) - TURN @ np.array([0.0, 0.0, 0.62])),
-)
-RIG = (FRONT, ASIDE)
 RIG_TIMES = np.linspace(0.0, 0.3, 10)[1:]
 
 

@@ -13,9 +13,18 @@ from morph_dslam.model import save_model
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.rig import RigCamera
 
 CAMERA = Camera(640, 480, 528.0, 528.0, 320.0, 240.0)
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
+# Several cameras of wide lenses, so that one by itself tells little along its sight line; 0.3 m apart.
+FRONT = RigCamera(Camera(480, 360, 330.0, 330.0, 240.0, 180.0), RigidTransform.identity())
+TURN = rotation_exp(np.array([0.0, 0.5, 0.0]))
+ASIDE = RigCamera(
+    Camera(480, 360, 350.0, 350.0, 235.0, 182.0),
+    RigidTransform(TURN, np.array([0.0, 0.0, 0.62]) - TURN @ np.array([0.0, 0.0, 0.62])),
+)
+RIG = (FRONT, ASIDE)
 
 
 def printed_texture(height=594, width=840, seed=0):

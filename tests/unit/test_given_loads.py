@@ -18,11 +18,12 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import reaction_in_direction
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.identification.identify import FACTOR, identify
+from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.prior import KnownValues
 from morph_dslam.identification.report import identification_lines, summarise
+from morph_dslam.identification.values import FACTOR
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
 

@@ -24,7 +24,7 @@ from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measurements import Measurement, Unknowns
 from morph_dslam.identification.prior import KnownValues
 from morph_dslam.identification.scatter import Design, Noise, Scatter, directions
-from morph_dslam.identification.values import FACTOR as FACTOR, Values
+from morph_dslam.identification.values import FACTOR, Values
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.flat_sides import LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE

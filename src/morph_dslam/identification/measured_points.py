@@ -73,12 +73,16 @@ class MeasuredPoints:
     @property
     def groups(self) -> NDArray[np.int64]:
         labels = np.unique(self.states, return_inverse=True)[1]
-        return np.repeat(labels[:, None], 3, axis=1)[self._present]
+        return self._of_values(labels)
 
     @property
     def value_states(self) -> tuple[str, ...]:
         """The state of each value (n,)."""
-        return tuple(np.repeat(np.array(self.states)[:, None], 3, axis=1)[self._present].tolist())
+        return tuple(self._of_values(np.array(self.states)).tolist())
+
+    def _of_values(self, rows: NDArray) -> NDArray:
+        """What each row (r,) has, for each coordinate that was measured (n,)."""
+        return np.repeat(rows[:, None], 3, axis=1)[self._present]
 
     @cached_property
     def _present(self) -> NDArray[np.bool_]:
@@ -144,8 +148,7 @@ class MeasuredPoints:
         shares = [
             (self.known[n] - parameters[n].lower) / (parameters[n].upper - parameters[n].lower) for n in self.known
         ]
-        repeated = [np.repeat(share[:, None], 3, axis=1)[self._present] for share in shares]
-        return np.array(repeated, dtype=np.float64)
+        return np.array([self._of_values(share) for share in shares], dtype=np.float64)
 
     def slopes_by_given(self, unknowns: Unknowns) -> Array:
         """Derivatives (n, p) of adjusted predictions by the known parameters, each over its range."""

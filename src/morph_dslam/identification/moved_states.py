@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.identification.identify import Misfit
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.scatter import directions
@@ -93,9 +93,7 @@ def _chance(missed: Array, null: Array, more: Array, least: float) -> tuple[floa
     left, least_left = (float(np.sum((missed - b @ (b.T @ missed)) ** 2)) for b in (before, after))
     if q < 1 or freedom < 1:
         return 1.0, 0.0
-    variance = max(least_left / freedom, least**2)
-    ratio = max(left - least_left, 0.0) / q / variance if variance > 0.0 else 0.0
-    return float(fdtrc(q, freedom, ratio)), float(np.sqrt(least_left / len(missed)))
+    return chance_of_better_fit(left, least_left, q, freedom, least), float(np.sqrt(least_left / len(missed)))
 
 
 def _alike(columns: Array) -> Array:

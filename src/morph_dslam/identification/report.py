@@ -16,11 +16,12 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import SMALL_SHARE, noticed, reaction_remark
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.doubts import notices
-from morph_dslam.identification.identify import FACTOR, Estimate, Identification, Misfit
+from morph_dslam.identification.identify import Estimate, Identification, Misfit
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.missed_states import missed_state_notes, state_figures
 from morph_dslam.identification.moved_states import moved_state_notes, moved_states
+from morph_dslam.identification.values import FACTOR
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
 from morph_dslam.model import Parameter

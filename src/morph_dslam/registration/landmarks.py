@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, check_kind
 from morph_dslam.geometry import RigidTransform
@@ -137,7 +137,7 @@ def register_landmarks(
     facts = _facts(fit, len(alternatives)) | placed.facts
     aids = "depth images" if image is not None else "depth images, the outline (--snap)"
     covariance, notes = _with_plausible_states(fit, placed, aids)
-    warnings = [*_warnings(fit, placed, moved, is_by_depth=depth is not None), *notes]
+    warnings = [*_warnings(fit, placed, moved), *notes]
     for part, seen in zip(cameras, given, strict=True):
         warnings += turned_away(model, part.seen(placed.estimate.state), seen.points)
     return Registration(
@@ -166,7 +166,7 @@ class _Placed:
     is_corrected : whether something beside landmarks decided.
     behind : share of the depths on it that lie behind it.
     left : share of the landmarks' residuals that is left where the scale of the depths suits them best, as far as it
-        is known; 1 without depth.
+        is known; None without depth.
     """
 
     estimate: Estimate
@@ -177,7 +177,7 @@ class _Placed:
     facts: dict[str, Any] = field(default_factory=dict)
     is_corrected: bool = False
     behind: float = 0.0
-    left: float = 1.0
+    left: float | None = None
 
 
 def _precise(fit: LandmarkFit) -> Estimator:
@@ -203,7 +203,8 @@ def _by_depth(
     best = found.estimate
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
     facts, behind = {"along_the_sight_line": "by depth"}, share_behind(precise, best.state, depth, deviations[0])
-    return _Placed(best, covariance, None, alternatives, (), facts, True, behind, _left_at_best_scale(fit, found))
+    left = _left_at_best_scale(fit, found)
+    return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind, left=left)
 
 
 def _left_at_best_scale(fit: LandmarkFit, found: FoundByDepth) -> float:
@@ -256,9 +257,7 @@ def _facts(fit: LandmarkFit, n_alternatives: int) -> dict[str, Any]:
     }
 
 
-def _warnings(
-    fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None, is_by_depth: bool
-) -> list[RegistrationWarning]:
+def _warnings(fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None) -> list[RegistrationWarning]:
     """What a reader must know of the fit."""
     model, best, points = fit.estimator.model, placed.estimate, fit.landmarks.points.rest
     found: list[RegistrationWarning] = []
@@ -266,7 +265,7 @@ def _warnings(
     contradiction = cameras_contradict(fit.estimator, bound, pixels, fit.best, fit.click_px)
     if contradiction is not None:
         found.append(contradiction)
-    fits = _of_residuals(fit, best, moved, placed.left if is_by_depth else None)
+    fits = _of_residuals(fit, best, moved, placed.left)
     if fits is not None and not (isinstance(fits, PoorFit) and contradiction is not None):
         found.append(fits)
     # Landmarks take up most of a depth that is shifted: that they fit says little.
@@ -301,9 +300,8 @@ def _of_residuals(
     if left is not None and np.isfinite(alone_px):
         squares, by_depth = (float(np.sum(residuals**2)) for residuals in (fit.best.residuals, left * best.residuals))
         # Depth that is right moves the unknowns by no more than the landmarks' errors: F of all of them.
-        ratio = (by_depth - squares) / (unknowns * max(squares / (numbers - unknowns), click_px**2))
-        is_unlikely = fdtrc(unknowns, numbers - unknowns, max(ratio, 0.0)) < DEPTH_CHANCE
-        if is_unlikely or left_px > max(fit.poor_px, POOR_FIT * max(alone_px, click_px)):
+        chance = chance_of_better_fit(by_depth, squares, unknowns, numbers - unknowns, click_px)
+        if chance < DEPTH_CHANCE or left_px > max(fit.poor_px, POOR_FIT * max(alone_px, click_px)):
             return DepthAgainstLandmarks(alone_px, left_px)
     if left_px > fit.poor_px:
         return PoorFit(left_px, click_px)

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.registration.messages import NotAtRest
 from morph_dslam.registration.outline_snap import EXCLUDED
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State
@@ -47,17 +47,17 @@ def not_at_rest(
     model, d = estimator.model, len(estimator.model.study_parameters)
     freedom = 2 * len(bound) - 6 - d
     # The largest F, of free parameters that explain all of it, spares most fits the search.
-    if not d or freedom < 1 or fdtrc(d, freedom, 2.0 * resting.cost / (d * click_px**2)) > REST_CHANCE:
+    if not d or freedom < 1 or chance_of_better_fit(2.0 * resting.cost, 0.0, d, freedom, click_px) > REST_CHANCE:
         return None
     lower, upper = estimator.box.lower.copy(), estimator.box.upper.copy()
     lower[:d], upper[:d] = model.lower[:d], model.upper[:d]
     free = estimator.within(replace(estimator.box, lower=lower, upper=upper))
     found = free.estimate_from(bound, pixels, np.ones(len(bound)), [resting.state, *others])
     best = next((estimate for estimate in found if np.isfinite(estimate.residuals).all()), resting)
-    ratio = (resting.cost - best.cost) / max(best.cost, freedom * click_px**2 / 2.0) * freedom / d
+    chance = chance_of_better_fit(2.0 * resting.cost, 2.0 * best.cost, d, freedom, click_px)
     motion = model.positions(best.state.parameters) - model.positions(model.default)
     moved, size = np.linalg.norm(motion, axis=1).max(), np.linalg.norm(np.ptp(model.nodes, axis=0))
-    if fdtrc(d, freedom, max(ratio, 0.0)) > REST_CHANCE or moved < least_share * size:
+    if chance > REST_CHANCE or moved < least_share * size:
         return None
     away = (best.state.parameters - model.default)[:d] ** 2 > EXCLUDED * np.diag(best.covariance)[:d]
     values = zip(model.study_parameters, best.state.parameters[:d], away, strict=True)

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.special import fdtrc
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.registration.messages import CamerasContradict
 from morph_dslam.registration.starts import pose_starts, shape_starts
@@ -54,8 +54,7 @@ def cameras_contradict(
     squares = float(np.sum(together.residuals**2))
 
     def is_chance(left: float) -> bool:
-        ratio = (squares - left) / (n_freed * max(left / freedom, click_px**2))
-        return bool(fdtrc(n_freed, freedom, max(ratio, 0.0)) > RIG_CHANCE)
+        return chance_of_better_fit(squares, left, n_freed, freedom, click_px) > RIG_CHANCE
 
     # Free poses that explain all of it have the largest F, which spares most fits.
     if not freed or counts[0] < FEWEST_OF_CAMERA or freedom < 1 or is_chance(0.0):

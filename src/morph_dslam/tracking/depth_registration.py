@@ -138,12 +138,11 @@ class _DepthFit:
         hessian = variance * slopes.T @ slopes
         at = self._at(step)
         best = Minimum(at, variance * found.cost, hessian, self._away(step), found.nfev, converged)
-        by_scale = np.zeros((len(slopes), 1))
-        by_scale[2 * len(self._pixels) :, 0] = scale_slopes(self._term, self._estimator.camera, at)
+        by_scale = np.zeros(len(slopes))
+        by_scale[2 * len(self._pixels) :] = scale_slopes(self._term, self._estimator.camera, at)
         scale = self._scale[free]
-        taken = np.linalg.lstsq(slopes[:, free] * scale, -by_scale)[0][:, 0]
         moves = np.zeros(d + 6)
-        moves[free] = scale * taken
+        moves[free] = scale * np.linalg.lstsq(slopes[:, free] * scale, -by_scale)[0]
         return best, moves
 
     def _at(self, step: Array) -> State:

@@ -163,8 +163,9 @@ def _own_spread(hypothesis: PoseHypothesis) -> float:
     """
     rows = hypothesis.inliers
     pixels, residuals = hypothesis.measurement.pixels[rows], hypothesis.estimate.residuals[: len(rows)][rows]
-    apart = np.abs(pixels[:, None] - pixels).max(axis=2) >= PATCH_WINDOW
-    squared = np.where(apart, np.sum((pixels[:, None] - pixels) ** 2, axis=2), np.inf)
+    between = pixels[:, None] - pixels
+    apart = np.abs(between).max(axis=2) >= PATCH_WINDOW
+    squared = np.where(apart, np.sum(between**2, axis=2), np.inf)
     has_one = apart.any(axis=1)
     if not has_one.any():
         return hypothesis.estimate.sigma_px

@@ -249,7 +249,7 @@ class KnownParameters:
         self._set(indices, with_usual_deviations(self.model, indices, values))
 
     def take(self, other: KnownParameters) -> None:
-        """Know in the present frame what another one does, as a camera of a rig does what is told to the rig."""
+        """Know in the present frame what another one does, as a camera of a rig does what the rig knows."""
         self.indices, self.now = other.indices, other.now
 
     def _set(self, indices: NDArray[np.int64], values: Array) -> None:

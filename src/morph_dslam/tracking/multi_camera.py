@@ -182,8 +182,9 @@ class RigTracker:
             If a picture or its depth is not of its camera's size, or of another type.
         """
         where = localization or CameraLocalization()
-        self.estimator.known.begin(*_number_and_time(frames))
-        known, results = where.pose_prior, self._each(frames, where.pose_prior, occluder_depths)
+        number, time = _number_and_time(frames)
+        self.estimator.known.begin(number, time)
+        known, results = where.pose_prior, self._each(frames, time, where.pose_prior, occluder_depths)
         has_moved = any(result.warning(ObjectMoved) is not None for result in results)
         prior = None if known is None or has_moved else self._prior(known, results)
         with frame_clock(STAGES) as clock, stage("fuse"):
@@ -222,12 +223,12 @@ class RigTracker:
     def _each(
         self,
         frames: Sequence[Frame | NDArray[np.uint8] | None],
+        time: float | None,
         known: PosePrior | None,
         occluder_depths: Sequence[NDArray[np.float32]] | None,
     ) -> list[FrameResult]:
-        """What each camera finds by itself; parameters as of `track`, with the map's pose in the rig's frame."""
+        """What each camera finds by itself at an instant's time; else as `track`, with the map's pose in the rig."""
         results = []
-        time = next((frame.timestamp for frame in frames if isinstance(frame, Frame)), None)
         for number, (tracker, part, frame) in enumerate(zip(self.trackers, self.cameras, frames, strict=True)):
             tracker.estimator.known.take(self.estimator.known)
             if frame is None or isinstance(frame, MissingFrame):

@@ -88,7 +88,7 @@ class RigErrors:
         prior: Prior | None,
         common_px: Sequence[float],
         blurred: Sequence[Array | None] | None = None,
-        known: Array | float = 0.0,
+        known: Array | None = None,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
 
@@ -100,7 +100,7 @@ class RigErrors:
         common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
         blurred : by camera (p, 2), the paths over which motion smears the points, pixels; None where it does no harm,
             or for all.
-        known : (d + 6, d + 6) what something else that measures parameters adds to the Hessian; 0 where nothing does.
+        known : (d + 6, d + 6) what something else that measures parameters adds to the Hessian; None for nothing.
         """
         views = self._views(estimate, measured)
         frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
@@ -108,7 +108,8 @@ class RigErrors:
         hessian = np.sum([view.chain.T @ frame.hessian @ view.chain for view, frame in both], axis=0)
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
-        hessian = hessian + known
+        of_known = np.zeros_like(hessian) if known is None else known
+        hessian = hessian + of_known
         gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
         stated = covariance
         for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
@@ -119,7 +120,7 @@ class RigErrors:
                 covariance = covariance + moved @ moved.T
         moved = self._moved_by_depths(hessian, views, measured)
         covariance = covariance + np.outer(moved, moved)
-        self._by_known = gain @ (known + np.zeros_like(hessian))
+        self._by_known = gain @ of_known
         if self._is_known:
             pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
             transfer = gain @ np.sum(pushes, axis=0)
