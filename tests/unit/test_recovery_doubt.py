@@ -3,12 +3,20 @@
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from morph_dslam.tracking.hypothesis import reject
+from morph_dslam.camera import Camera
+from morph_dslam.geometry import RigidTransform
+from morph_dslam.tracking.hypothesis import Image, reject
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import Rejection, RejectionReason
+from morph_dslam.tracking.patches import NEUTRAL
 from morph_dslam.tracking.recovery import Recovery
+from morph_dslam.tracking.state import State
+
+CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
 
 
 def attempt(share, sigma_px, prior=None, visible=1.0, alike=False) -> Any:
@@ -96,3 +104,37 @@ def test_a_pose_that_is_held_says_nothing_of_a_frame(share, followed, believed):
     torn = attempt(share, 3.5, prior=object(), alike=True)
     assert (still.reject(torn, followed) is None) == believed
     assert still.doubt(attempt(0.4, 0.5, prior=object())) == pytest.approx(0.4)
+
+
+def test_places_where_no_point_agrees_when_they_are_compared_again_are_no_places():
+    """Seen from where a print's period puts the object, the shape found there may have nothing in common with it."""
+    rng = np.random.default_rng(3)
+    tile = cv2.GaussianBlur(rng.integers(0, 255, (40, 40), dtype=np.uint8), (0, 0), 2.0)
+    shown = np.full((160, 200), NEUTRAL, np.uint8)
+    frame, depth = shown.copy(), np.full(shown.shape, np.inf, np.float32)
+    shown[20:60, 20:60] = frame[100:140, 20:60] = frame[20:60, 140:180] = tile
+    depth[20:60, 20:60] = 1.0
+    pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    compared = iter([attempt(0.8, 0.3), attempt(0.0, np.nan), attempt(0.8, 0.3), attempt(0.0, np.nan)])
+
+    def correct(picture, state, offsets, held):
+        found = next(compared)
+        found.estimate.state = state
+        found.measurement.pixels = found.measurement.pixels + CAMERA.project(state.camera_from_object.translation)
+        return found
+
+    lost = Rejection(RejectionReason.FEW_POINTS, 0, 200, 20)
+    reference: Any = SimpleNamespace(
+        rendered=lambda state: SimpleNamespace(image=shown, depth=depth),
+        points=SimpleNamespace(in_camera=lambda state: np.ones((5, 3))),
+        relocaliser=SimpleNamespace(find=lambda grey, shapes, mask: (None, 3)),
+        redundancy=1.0,
+    )
+    model: Any = SimpleNamespace(lower=np.zeros(1), upper=np.ones(1), default=np.zeros(1))
+    estimation: Any = SimpleNamespace(correct=correct)
+    recovery = Recovery(model, CAMERA, reference, estimation, TrackerOptions())
+    found, rejection = recovery.recover(Image(grey=frame, normalized=frame), State(np.zeros(1), pose), lost)
+    assert found is None
+    assert rejection is not None
+    assert rejection.then == Rejection(RejectionReason.FEW_FEATURES, 3)
+    assert next(compared, None) is None  # both places were compared twice

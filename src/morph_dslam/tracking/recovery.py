@@ -185,8 +185,12 @@ class Recovery:
         for shift in shifts / [self._camera.fx, self._camera.fy] * depth:
             moved = RigidTransform(pose.rotation, pose.translation + np.append(shift, 0.0))
             place = self._estimation.correct(picture, replace(state, camera_from_object=moved), None, None)
+            if reject(place, self._options) is not None:
+                continue
+            # Compared again in the shape that was found, hardly a point may agree any more.
+            place = self._estimation.correct(picture, place.estimate.state, None, None)
             if reject(place, self._options) is None:
-                places.append(self._estimation.correct(picture, place.estimate.state, None, None))
+                places.append(place)
         return places
 
     def _about_as_good(self, other: PoseHypothesis, best: PoseHypothesis) -> bool:
