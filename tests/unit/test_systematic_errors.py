@@ -18,10 +18,11 @@ from morph_dslam.tracking.covariance import (
 )
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
 from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.reference_misfit import FLOOR_PX, ReferenceMisfit
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import moved
 from morph_dslam.tracking.still import held
-from morph_dslam.tracking.systematic_errors import FLOOR_PX, ReferenceMisfit, SystematicErrors, error_factors_of
+from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import measured
 from tests.support.rendered_sequence import CAMERA, sheet_state

@@ -36,10 +36,10 @@ from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
 from morph_dslam.tracking.patches import zero_where_unknown
 from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.reference_misfit import Unexplained
 from morph_dslam.tracking.row_motion import RowMotion
 from morph_dslam.tracking.sequence_filter import Fitter, SequenceFilter
 from morph_dslam.tracking.state import BoundPoints, moved, pose_increment
-from morph_dslam.tracking.systematic_errors import Unexplained
 
 Array = NDArray[np.float64]
 _Measured = tuple[BoundPoints, Array, Array]

@@ -33,9 +33,9 @@ from morph_dslam.tracking.outcomes import (
     SurfaceJumps,
     TrackingWarning,
 )
+from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.sequence_filter import SequenceFilter
-from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE
 from morph_dslam.tracking.views import ActiveView
 
 

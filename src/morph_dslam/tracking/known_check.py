@@ -13,7 +13,8 @@ from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.outcomes import KnownRefuted
-from morph_dslam.tracking.systematic_errors import REFUTED, SystematicErrors
+from morph_dslam.tracking.reference_misfit import REFUTED
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,12 @@ from morph_dslam.tracking.covariance import held_by
 from morph_dslam.tracking.depth import SCALE_STD
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
+from morph_dslam.tracking.linearization import inverse_of_seen
 from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
+from morph_dslam.tracking.reference_misfit import Unexplained
 from morph_dslam.tracking.rig import RigCamera
-from morph_dslam.tracking.systematic_errors import SystematicErrors, Unexplained, inverse_of_seen
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 from morph_dslam.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]

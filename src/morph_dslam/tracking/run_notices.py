@@ -33,8 +33,8 @@ from morph_dslam.tracking.outcomes import (
     TimeOutside,
     TrackingWarning,
 )
+from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE, FLOOR_PX, UNEXPLAINED_PX
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.systematic_errors import CLEARLY_WORSE, FLOOR_PX, UNEXPLAINED_PX
 
 _Warning = TypeVar("_Warning", bound=TrackingWarning)
 

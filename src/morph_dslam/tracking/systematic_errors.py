@@ -21,7 +21,7 @@ of their estimate enters as H^-1 I T. Both errors are thus considered over all f
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -29,24 +29,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR, BoundPart, SharedErrors, held_by
+from morph_dslam.tracking.covariance import BoundPart, SharedErrors, held_by
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
+from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
+from morph_dslam.tracking.reference_misfit import FLOOR_PX, BeyondReference, ReferenceMisfit, Unexplained
 from morph_dslam.tracking.reprojection import project_with_jacobian
 
 Array = NDArray[np.float64]
-#: More than this, pixels, and more than half of the residuals' variance, counts as the model's failure.
-UNEXPLAINED_PX = 0.5
-#: What comparing windows leaves in neighbours alike, pixels: an expectation well below says nothing.
-FLOOR_PX = 0.05
-#: Frames over which what was learnt of the reference fades, by a factor e.
-MEMORY = 600.0
-#: More than so many times the stated deviation of the reference is a warning.
-CLEARLY_WORSE = 2.0
-#: A measurement so many standard deviations from a stated value refutes it. A right one is off by more in one
-#: frame of 15000 if errors are Gaussian; those of the registration are the same in all frames.
-REFUTED = 4.0
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
 
@@ -63,123 +54,6 @@ def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
         return None
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """What the model leaves of the residuals.
-
-    Attributes
-    ----------
-    px : standard deviation of a pixel coordinate that neighbours have in common
-    total_px : standard deviation of a pixel coordinate, all of it
-    """
-
-    px: float
-    total_px: float
-
-    @property
-    def is_failure(self) -> bool:
-        """Whether the model, not noise, is what is left."""
-        return self.px > UNEXPLAINED_PX and self.px**2 > 0.5 * self.total_px**2
-
-
-@dataclass(frozen=True)
-class BeyondReference:
-    """What is left of the residuals that no error of the reference state leaves, however large.
-
-    Attributes
-    ----------
-    common : variance of a pixel coordinate that neighbours have in common in it, px²; by chance negative too
-    chance : its standard deviation where only noise is left, px²
-    share : how much of a model's error is left in it
-    noise : variance of a pixel coordinate that neighbours do not have in common, px²
-    """
-
-    common: float
-    chance: float
-    share: float
-    noise: float
-
-    @property
-    def is_failure(self) -> bool:
-        """Whether it is the model's doing, whose whole error is then large, and larger than noise.
-
-        An estimate takes up most of a model's error by a wrong pose and shape: what is left may be small.
-        """
-        whole = self.common / self.share
-        return self.common > REFUTED * self.chance and whole > max(UNEXPLAINED_PX**2, self.noise)
-
-
-@dataclass(frozen=True)
-class Linearization:
-    """A frame's points about its estimate; all is zero for those that do not count.
-
-    Attributes
-    ----------
-    usable : (p,) those that count
-    residuals : (p, 2), pixels
-    jacobian : (p, 2, d + 6) of the pixels
-    weighted_jacobian : (p, 2, d + 6), that times the weights
-    weights : (p,) with Huber's factor
-    """
-
-    usable: NDArray[np.bool_]
-    residuals: Array
-    jacobian: Array
-    weighted_jacobian: Array
-    weights: Array
-
-    @property
-    def hessian(self) -> Array:
-        """J' W J (d + 6, d + 6)."""
-        return self.products(self.jacobian)
-
-    def products(self, rows: Array) -> Array:
-        """J' W times ``rows`` (p, 2, m): (d + 6, m)."""
-        weighted = self.weighted_jacobian
-        return weighted.reshape(-1, weighted.shape[2]).T @ rows.reshape(-1, rows.shape[2])
-
-    def left(self, moved: Array, transfer: Array) -> Array:
-        """What an estimate that moves by ``transfer`` (d + 6, m) leaves of motions (p, 2, m) of the pixels."""
-        taken = self.jacobian.reshape(-1, len(transfer)) @ transfer
-        return np.where(self.usable[:, None, None], moved - taken.reshape(moved.shape), 0.0)
-
-    def with_unknowns(self, moved: Array) -> Linearization:
-        """As if there were more unknowns, by which the pixels move by ``moved`` (p, 2, c)."""
-        weighted = self.weights[:, None, None] * moved
-        return replace(
-            self,
-            jacobian=np.concatenate([self.jacobian, moved], axis=2),
-            weighted_jacobian=np.concatenate([self.weighted_jacobian, weighted], axis=2),
-        )
-
-
-class ReferenceMisfit:
-    """By how much the reference state is worse known than was stated, as the frames of a sequence show it.
-
-    By the stated covariance of the reference state neighbours have e px² a coordinate in common in the
-    residuals; the frame shows o px². One factor f of the variance holds for the whole sequence, o = f e: the
-    least squares slope over the frames, in which those that expect much count most (a variance component by
-    the method of moments; Rao 1971, J. Multivariate Analysis 1, 257). A frame in which the object is as in
-    the reference view expects nothing. So the factor starts as one, as if a frame with `FLOOR_PX` of both had
-    said so.
-    """
-
-    def __init__(self) -> None:
-        self._fade = np.exp(-1.0 / MEMORY)
-        self._product = self._square = 0.0
-
-    def learn(self, shown: float, expected: float) -> None:
-        """Take in what a frame shows and what was expected of it, px²; noise makes the first negative too."""
-        self._product = self._fade * self._product + shown * expected
-        self._square = self._fade * self._square + expected**2
-
-    @property
-    def factor(self) -> float:
-        """Of the variance; one where the frames show no more than was stated."""
-        one = FLOOR_PX**4
-        return max((self._product + one) / (self._square + one), 1.0)
 
 
 class SystematicErrors:
@@ -462,7 +336,7 @@ class SystematicErrors:
         """The frame of an estimate whose points had these ``weights`` (p,)."""
         _, jacobian = self._project(estimate.state)
         residuals, huber = estimate.residuals[: len(weights)], self._estimator.options.huber_px
-        return Linearization(*_counting(jacobian, np.ascontiguousarray(residuals), weights, huber))
+        return Linearization.of(jacobian, residuals, weights, huber)
 
     def _project(self, state: State, rows: Array | None = None) -> tuple[Array, Array]:
         """Pixels (p, 2) and their derivatives, by other values and derivatives (1 + d, m) of the functions if given."""
@@ -480,21 +354,6 @@ class SystematicErrors:
         """How pixels move (p, 2, c) in a view where they move by ``moved`` (p, 2, c) in the reference view."""
         pixels = self._estimator.camera.project(self._corners.in_camera(state))
         return _warped_motions(pixels, self._inverse_edges, moved)
-
-
-@njit(cache=True, nogil=True)
-def _counting(jacobian, residuals, weights, huber):
-    """What `Linearization` holds, of all points' Jacobian (p, 2, n), residuals (p, 2) and weights (p,)."""
-    usable = np.zeros(len(weights), np.bool_)
-    seen, left, weighted = np.zeros_like(jacobian), np.zeros_like(residuals), np.zeros_like(jacobian)
-    counted = np.zeros(len(weights))
-    for j in range(len(weights)):
-        length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
-        if weights[j] > 0.0 and np.isfinite(length + np.sum(jacobian[j])):
-            usable[j] = True
-            weight = weights[j] * min(1.0, huber / max(length, 1e-300))
-            left[j], seen[j], weighted[j], counted[j] = residuals[j], jacobian[j], weight * jacobian[j], weight
-    return usable, left, seen, weighted, counted
 
 
 @njit(cache=True, nogil=True)
@@ -519,14 +378,6 @@ def _warped_motions(pixels, inverse_edges, moved):
                 for k in range(moved.shape[2]):
                     found[j, row, k] = warp[row, 0] * moved[j, 0, k] + warp[row, 1] * moved[j, 1, k]
     return found
-
-
-def inverse_of_seen(hessian: Array, scale: Array) -> Array:
-    """H^-1 (n, n); nothing moves along what neither the images nor a prior determine."""
-    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    seen = values > max(values[-1], 1e-30) * EIGENVALUE_FLOOR
-    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
-    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
 
 
 def _by_parts(parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
