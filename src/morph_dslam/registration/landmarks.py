@@ -8,7 +8,7 @@ like one away from it) is reported and not chosen by accident.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.initialization import undistorted_grey
 from morph_dslam.registration.landmark_binding import MOST_OF_IT, PART_OF_IT, bind_in_cameras, extent, other_unit
-from morph_dslam.registration.landmark_fit import LEAST_PX, POOR_FIT, LandmarkFit, fit_landmarks, without_parameters
+from morph_dslam.registration.landmark_fit import POOR_FIT, LandmarkFit, fit_landmarks, without_parameters
 from morph_dslam.registration.landmark_sides import turned_away
 from morph_dslam.registration.messages import (
     Ambiguity,
@@ -49,7 +49,6 @@ from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M
 from morph_dslam.tracking.depth_registration import FoundByDepth, refine_by_depth, share_behind
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.rig import RigCamera
-from morph_dslam.tracking.state import moved as at_step
 
 Array = NDArray[np.float64]
 #: Standard deviation of a carefully set landmark, pixels.
@@ -147,7 +146,7 @@ def register_landmarks(
         facts=facts,
         warnings=tuple(warnings),
         alternatives=placed.alternatives,
-        by_depth=depth is not None,
+        depth_scale=None if placed.by_depth is None else placed.by_depth.scale,
     )
 
 
@@ -165,8 +164,7 @@ class _Placed:
     facts : on that too.
     is_corrected : whether something beside landmarks decided.
     behind : share of the depths on it that lie behind it.
-    left : share of the landmarks' residuals that is left where the scale of the depths suits them best, as far as it
-        is known; None without depth.
+    by_depth : what depth says of it; None without depth.
     """
 
     estimate: Estimate
@@ -177,7 +175,7 @@ class _Placed:
     facts: dict[str, Any] = field(default_factory=dict)
     is_corrected: bool = False
     behind: float = 0.0
-    left: float | None = None
+    by_depth: FoundByDepth | None = None
 
 
 def _precise(fit: LandmarkFit) -> Estimator:
@@ -195,29 +193,16 @@ def _by_depth(
     at_rest: bool,
 ) -> _Placed:
     """The object along the sight line by the frame's depth (h, w), with its deviations at 1 m and of its scale."""
-    # How well the landmarks fit shows how carefully they were set, where they are enough to show it.
-    sigma = max(fit.best.sigma_px, LEAST_PX) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
+    # How well the landmarks fit shows how carefully they were set. A few that happen to fit well are no more exact.
+    sigma = max(fit.best.sigma_px, fit.click_px) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
     landmarks = fit.landmarks
     precise = _precise(fit)
     found = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, *deviations)
     best = found.estimate
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
-    facts, behind = {"along_the_sight_line": "by depth"}, share_behind(precise, best.state, depth, deviations[0])
-    left = _left_at_best_scale(fit, found)
-    return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind, left=left)
-
-
-def _left_at_best_scale(fit: LandmarkFit, found: FoundByDepth) -> float:
-    """Share of the landmarks' residuals that is left where the scale of the depths suits these best, as known as it is.
-
-    What depths of another scale leave does not contradict the landmarks: the covariance contains it.
-    """
-    state, points = found.estimate.state, fit.landmarks.points
-    there, here = (fit.estimator.pixels(points, at) for at in (at_step(state, found.by_scale), state))
-    along, residuals = (there - here).ravel(), found.estimate.residuals.ravel()
-    squares, variance = float(residuals @ residuals), max(fit.click_px, np.nan_to_num(fit.best.sigma_px)) ** 2
-    taken = float(along @ residuals) ** 2 / (float(along @ along) + variance)
-    return float(np.sqrt(max(1.0 - taken / max(squares, 1e-30), 0.0)))
+    facts = {"along_the_sight_line": "by depth", "depth_scale": asdict(found.scale)}
+    behind = share_behind(precise, best.state, depth * found.scale.factor, deviations[0])
+    return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind, by_depth=found)
 
 
 def _by_outline(fit: LandmarkFit, placed: _Placed, grey: NDArray[np.uint8]) -> _Placed:
@@ -265,7 +250,7 @@ def _warnings(fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None) -> lis
     contradiction = cameras_contradict(fit.estimator, bound, pixels, fit.best, fit.click_px)
     if contradiction is not None:
         found.append(contradiction)
-    fits = _of_residuals(fit, best, moved, placed.left)
+    fits = _of_residuals(fit, best, moved, placed.by_depth)
     if fits is not None and not (isinstance(fits, PoorFit) and contradiction is not None):
         found.append(fits)
     # Landmarks take up most of a depth that is shifted: that they fit says little.
@@ -285,26 +270,30 @@ def _warnings(fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None) -> lis
 
 
 def _of_residuals(
-    fit: LandmarkFit, best: Estimate, moved: NotAtRest | None, left: float | None
+    fit: LandmarkFit, best: Estimate, moved: NotAtRest | None, by_depth: FoundByDepth | None
 ) -> RegistrationWarning | None:
-    """What the residuals of the best estimate, or too few landmarks, say.
+    """What the residuals of the best estimate, which is that by depth where there is any, or too few landmarks, say.
 
-    ``left`` is the share of residuals beside what the scale of depths explains; None without depth.
+    A scale of the depths that is not the likeliest counts as a residual.
     """
     numbers, unknowns, click_px = 2 * len(fit.landmarks), len(fit.estimator.model.parameters) + 6, fit.click_px
-    alone_px, left_px = fit.best.sigma_px, best.sigma_px * (1.0 if left is None else left)
+    alone_px = fit.best.sigma_px
     if numbers <= unknowns:
         return Underdetermined(numbers, unknowns, unknowns // 2 + 3)
     if moved is not None:
         return moved
-    if left is not None and np.isfinite(alone_px):
-        squares, by_depth = (float(np.sum(residuals**2)) for residuals in (fit.best.residuals, left * best.residuals))
+    of_scale = 0.0 if by_depth is None else (by_depth.deviations * max(click_px, np.nan_to_num(alone_px))) ** 2
+    left_px = float(np.sqrt(best.sigma_px**2 + of_scale / (numbers - unknowns)))
+    if by_depth is not None and np.isfinite(alone_px):
+        squares, left = (float(np.sum(estimate.residuals**2)) for estimate in (fit.best, best))
         # Depth that is right moves the unknowns by no more than the landmarks' errors: F of all of them.
-        chance = chance_of_better_fit(by_depth, squares, unknowns, numbers - unknowns, click_px)
+        chance = chance_of_better_fit(left + of_scale, squares, unknowns, numbers - unknowns, click_px)
         if chance < DEPTH_CHANCE or left_px > max(fit.poor_px, POOR_FIT * max(alone_px, click_px)):
             return DepthAgainstLandmarks(alone_px, left_px)
-    if left_px > fit.poor_px:
-        return PoorFit(left_px, click_px)
+    # Depth determines unknowns too, so that residuals by both have more degrees of freedom than landmarks alone.
+    own_px = left_px if by_depth is None else alone_px
+    if own_px > fit.poor_px:
+        return PoorFit(own_px, click_px)
     if numbers - unknowns < ENOUGH_SPARE:
         enough = -(-(unknowns + ENOUGH_SPARE) // 2)
         return FewLandmarks(len(fit.landmarks), max(best.sigma_px, click_px), enough)

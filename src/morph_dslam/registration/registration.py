@@ -27,6 +27,7 @@ from morph_dslam.registration.messages import (
     read_warning,
 )
 from morph_dslam.slam.pose import PoseEstimate
+from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.state import Prior, State, pose_increment
 
 if TYPE_CHECKING:
@@ -213,7 +214,7 @@ class Registration:
     scene : whose map it is registered in; None where there is none, or only its file is known.
     alternatives : other states that what it was registered by does not exclude, where they are known.
     rivals : other places in the map, the best first.
-    by_depth : whether depth images say how far away it is, with the scale error of these in the covariance.
+    depth_scale : of the depth images that say how far away it is, with its error in the covariance; None where none do.
     """
 
     model: ReducedModel
@@ -230,7 +231,7 @@ class Registration:
     scene: Scene | None = field(default=None, repr=False, compare=False)
     alternatives: tuple[State, ...] = ()
     rivals: tuple[Rival, ...] = ()
-    by_depth: bool = False
+    depth_scale: DepthScale | None = None
 
     def __repr__(self) -> str:
         """One line: what was registered by what, the parameters, and how many warnings there are."""

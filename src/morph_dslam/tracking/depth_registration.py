@@ -18,7 +18,7 @@ from morph_dslam.errors import RegistrationError
 from morph_dslam.sources.recorded import DEPTH_SCALE
 from morph_dslam.tracking.binding import bind_pixels, draw_view, view_of
 from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M, PointDepths
-from morph_dslam.tracking.depth_scale import scale_slopes
+from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.known_state import DepthTerm
 from morph_dslam.tracking.levenberg_marquardt import Minimum
@@ -43,13 +43,14 @@ class FoundByDepth:
 
     Attributes
     ----------
-    estimate : its covariance contains that all depths may be too large by one factor, which no residual of depths
-        shows.
-    by_scale : (d + 6,) by which one standard deviation of that factor moves it.
+    estimate : its covariance contains how well the scale of the depths is known.
+    scale : of all depths, as landmarks and what is known of the depth camera have it.
+    deviations : by which that scale differs from one, in the deviations that were known before.
     """
 
     estimate: Estimate
-    by_scale: Array
+    scale: DepthScale
+    deviations: float
 
 
 def refine_by_depth(
@@ -63,6 +64,9 @@ def refine_by_depth(
     scale_std: float = SCALE_STD,
 ) -> FoundByDepth:
     """The state of an object from landmarks and a depth image of the same view.
+
+    All depths may be off by one factor, which no residual of depths shows. It is one more unknown: where the landmarks
+    know the distance better than the depth camera does, they decide.
 
     Parameters
     ----------
@@ -79,11 +83,11 @@ def refine_by_depth(
     RegistrationError
         If there is hardly any depth where the landmarks have the object.
     """
-    found, by_scale = None, np.zeros(0)
+    fit, factor = None, 1.0
     for number in range(ROUNDS):
         # At first all of them may be off together, by what the scale of the depth camera may be.
         off = 0.0 if number else SCALE_SIGMAS * scale_std
-        points, places, measured, near = _depths_in_view(estimator, state, image, sigma_at_1m, off)
+        points, places, measured, near = _depths_in_view(estimator, state, image * factor, sigma_at_1m, off)
         depths = measured.only(near)
         if depths.count < LEAST:
             ratio = measured.ratio_to(points.in_camera(state)[:, 2])
@@ -93,18 +97,38 @@ def refine_by_depth(
                 f"landmarks give; {there}. Is the depth registered to this camera? If not, do that first; else correct "
                 f"--depth-per-metre, {DEPTH_SCALE}, or the landmarks"
             )
-        term = _term(estimator, state, points, places, depths)
-        found, by_scale = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state).minimum()
-        state = found.state
-    assert found is not None
-    estimate = estimator.finished(found, np.ones(len(pixels)), np.full(len(pixels), 2))
-    moved_by = scale_std * by_scale
-    estimate = replace(estimate, covariance=estimate.covariance + np.outer(moved_by, moved_by))
-    return FoundByDepth(estimate, moved_by)
+        term = _term(estimator, state, points, places, depths).scaled(1.0 / factor)
+        fit = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state, scale_std).minimum()
+        state, factor = fit.best.state, fit.scale.factor
+    assert fit is not None
+    estimate = estimator.finished(fit.best, np.ones(len(pixels)), np.full(len(pixels), 2))
+    estimate = replace(estimate, covariance=estimate.covariance + np.outer(fit.by_scale, fit.by_scale))
+    return FoundByDepth(estimate, fit.scale, fit.deviations)
+
+
+@dataclass(frozen=True)
+class _FittedDepth:
+    """Where landmarks and depth fit best.
+
+    Attributes
+    ----------
+    best : the Hessian is that of all unknowns, at the scale of the depths that was found.
+    scale : of the depths.
+    deviations : as of `FoundByDepth`.
+    by_scale : (d + 6,) by which one standard deviation of the scale moves the state, to first order.
+    """
+
+    best: Minimum
+    scale: DepthScale
+    deviations: float
+    by_scale: Array
 
 
 class _DepthFit:
-    """Residuals of landmarks and depth as a function of steps from a state."""
+    """Residuals of landmarks and depth as a function of steps from a state, and of the scale of all depths.
+
+    The last unknown is by how many of its deviations that scale, a factor, differs from one.
+    """
 
     def __init__(
         self,
@@ -114,50 +138,50 @@ class _DepthFit:
         sigma_px: float,
         term: DepthTerm,
         start: State,
+        scale_std: float,
     ) -> None:
         self._estimator, self._landmarks, self._pixels = estimator, landmarks, pixels
         self._sigma_px, self._term, self._start = sigma_px, term, start
-        self._scale = STEP * estimator.box.scale
+        self._scale, self._scale_std = STEP * estimator.box.scale, scale_std
 
-    def minimum(self) -> tuple[Minimum, Array]:
-        """Where both fit best, parameters that are known held; the Hessian is that of all unknowns.
-
-        Also how far that state moves (d + 6,), to first order, for all depths together, as a share of each.
-        """
+    def minimum(self) -> _FittedDepth:
+        """Where all fits best, parameters that are known held."""
         box, d = self._estimator.box, len(self._start.parameters)
-        free = np.concatenate([box.upper > box.lower, np.ones(6, dtype=bool)])
-        columns = np.eye(d + 6)[:, free]
-        bounds = np.full((2, d + 6), np.inf) * [[-1.0], [1.0]]
+        free = np.concatenate([box.upper > box.lower, np.ones(7, dtype=bool)])
+        columns = np.eye(d + 7)[:, free]
+        bounds = np.full((2, d + 7), np.inf) * [[-1.0], [1.0]]
         bounds[:, :d] = (np.array([box.lower, box.upper]) - self._start.parameters) / self._scale[:d]
         bounds += np.array([[-1e-6], [1e-6]])
         lower, upper = bounds[:, free]
         found = minimum(lambda step: self._residuals(columns @ step), np.zeros(columns.shape[1]), (lower, upper), 10)
         step = columns @ found.x
-        slopes = np.asarray(approx_fprime(step, self._residuals, DIFFERENCE)) / self._scale
+        derivatives = np.asarray(approx_fprime(step, self._residuals, DIFFERENCE))
+        slopes, by_deviation, free = derivatives[:, :-1] / self._scale, derivatives[:, -1], free[:-1]
         variance, converged = self._sigma_px**2, found.status > 0
         hessian = variance * slopes.T @ slopes
-        at = self._at(step)
-        best = Minimum(at, variance * found.cost, hessian, self._away(step), found.nfev, converged)
-        by_scale = np.zeros(len(slopes))
-        by_scale[2 * len(self._pixels) :] = scale_slopes(self._term, self._estimator.camera, at)
-        scale = self._scale[free]
-        moves = np.zeros(d + 6)
-        moves[free] = scale * np.linalg.lstsq(slopes[:, free] * scale, -by_scale)[0]
-        return best, moves
+        best = Minimum(self._at(step), variance * found.cost, hessian, self._away(step), found.nfev, converged)
+        scaled = slopes[:, free] * self._scale[free]
+        followed = -np.linalg.lstsq(scaled, by_deviation)[0]
+        std = 1.0 / float(np.linalg.norm(by_deviation + scaled @ followed))  # at most 1: what was known is in it
+        by_scale = np.zeros(d + 6)
+        by_scale[free] = std * self._scale[free] * followed
+        scale = DepthScale(1.0 + self._scale_std * float(step[-1]), std * self._scale_std)
+        return _FittedDepth(best, scale, float(step[-1]), by_scale)
 
     def _at(self, step: Array) -> State:
-        return self._estimator.box.nearest(moved(self._start, step * self._scale))
+        return self._estimator.box.nearest(moved(self._start, step[:-1] * self._scale))
 
     def _away(self, step: Array) -> Array:
         """How far the landmarks are from their pixels (k, 2)."""
         return self._estimator.camera.project(self._landmarks.in_camera(self._at(step))) - self._pixels
 
     def _residuals(self, step: Array) -> Array:
-        """Of landmarks and depths, in standard deviations."""
+        """Of landmarks, depths and their scale, in standard deviations."""
         away, huber = self._away(step), self._estimator.options.huber_px
         length = np.linalg.norm(away, axis=1, keepdims=True)
         away = away * np.sqrt(np.minimum(1.0, huber / np.maximum(length, 1e-12))) / self._sigma_px
-        return np.concatenate([away.ravel(), self._term.residuals(self._estimator.camera, self._at(step))])
+        term = self._term.scaled(1.0 + self._scale_std * step[-1])
+        return np.concatenate([away.ravel(), term.residuals(self._estimator.camera, self._at(step)), step[-1:]])
 
 
 def share_behind(

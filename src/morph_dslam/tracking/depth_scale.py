@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
@@ -16,6 +17,20 @@ Array = NDArray[np.float64]
 STEP = 1e-4
 #: That far to either side.
 LARGER, SMALLER = 1.0 + STEP, 1.0 - STEP
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """What all depths of a depth camera have to be multiplied by.
+
+    Attributes
+    ----------
+    factor : as far as it is known.
+    std : its standard deviation, a share.
+    """
+
+    factor: float = 1.0
+    std: float = 0.0
 
 
 class KnownByDepth(Protocol):

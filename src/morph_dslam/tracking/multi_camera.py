@@ -123,7 +123,12 @@ class RigTracker:
                 tracker = Tracker(
                     self.model,
                     part.camera,
-                    Registration(self.model, part.seen(registration.state)),
+                    # It is the first camera whose depths it knows.
+                    Registration(
+                        self.model,
+                        part.seen(registration.state),
+                        depth_scale=None if number else registration.depth_scale,
+                    ),
                     single,
                     reference=image,
                     in_sequence=in_sequence,
@@ -139,7 +144,7 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
-        depth_std = 0.0 if registration.by_depth else self.options.depth_scale_std
+        depth_std = self.options.depth_scale_std if registration.depth_scale is None else 0.0
         self._errors = RigErrors(self.trackers, self.cameras, depth_std)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._flat_sides = FlatSides(self.model, self._model_errors)

@@ -56,7 +56,8 @@ class PlacedObject:
     in_sequence : whether the frames to track begin with it.
     seen : by camera, where (h, w) the reference frame shows the object; None for all that it covers.
     keyframes : by camera, other images of the object as it is there; None where only the reference is known.
-    depth : (h, w) of the first camera's reference frame, metres, NaN where unknown; None where it does not count.
+    depth : (h, w) of the first camera's reference frame in the scale that the registration found, metres, NaN where
+        unknown; None where it does not count.
     """
 
     object: TrackedObject
@@ -88,6 +89,12 @@ class PlacedObject:
     def options(self) -> TrackerOptions:
         """That it is tracked with."""
         return self.object.tracker_options(self.registration)
+
+    @property
+    def depth_scale_std(self) -> float:
+        """Standard deviation of what all depths are off by together, a share."""
+        scale = self.registration.depth_scale
+        return self.options.depth_scale_std if scale is None else scale.std
 
     @cached_property
     def inner(self) -> list[CarriedStructure]:
@@ -209,7 +216,9 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and number in (None, run.first)
     placed = with_loads(registration, part.options)
-    depth = frames[0].depth if part.options.use_depth else None
+    depth, scale = frames[0].depth if part.options.use_depth else None, registration.depth_scale
+    if depth is not None and scale is not None:
+        depth = depth * np.float32(scale.factor)
     return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence, depth=depth)
 
 

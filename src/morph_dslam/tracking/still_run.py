@@ -68,7 +68,7 @@ def with_still_pose(
         constant,
         [n for n in range(len(names)) if part.object.at_rest and n not in constant],
         terms,
-        part.options.depth_scale_std,
+        part.depth_scale_std,
     )
     found = fit_still(problem, registration.alternatives)
     facts = registration.facts | {"pose": f"one for the whole sequence, from {len(keyframes)} frames"}

@@ -467,7 +467,7 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
     pixels, chosen = tracker.reference.pixels, choose_keyframes(keyframes)
     if not part.options.use_discrepancy:
         asked = tracker.estimator, known_state(part), pixels, registration.state, chosen
-        state, covariance = refine_reference(*asked, part.options.depth_scale_std)
+        state, covariance = refine_reference(*asked, part.depth_scale_std)
         refined = replace(registration, state=state, covariance=covariance)
     else:
         # What the state is wrong by counts with the discrepancy: to refine both would be the same twice.

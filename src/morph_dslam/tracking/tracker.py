@@ -163,6 +163,8 @@ class Tracker:
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
+        scale = registration.depth_scale
+        self._depth_factor = np.float32(1.0 if scale is None else scale.factor)
         use, sought = self.options.use_discrepancy, self.options.discrepancy
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
@@ -283,7 +285,8 @@ class Tracker:
             motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
             image = ready or picture.made_ready(self._undistortion)
             occluders = occluders_of(occluder_depth, self.camera, self._undistortion)
-            image = replace(image, depth=picture.depth, occluder_depth=occluders, motion=motion, is_taken=self.is_taken)
+            depth = None if picture.depth is None else picture.depth * self._depth_factor
+            image = replace(image, depth=depth, occluder_depth=occluders, motion=motion, is_taken=self.is_taken)
             if self._views is None:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
@@ -514,8 +517,8 @@ class Tracker:
             factors = keyframes.error_factors if view.outline_alone else None
             lasting = None if factors is None else factors[len(self.model.parameters) :]
             self._still = replace(held(known.state, self.estimator), lasting=lasting)
-        # A distance by depth holds the depths' scale itself: the frames' depths confirm it, whatever it is.
-        scale_std = 0.0 if known.by_depth else options.depth_scale_std
+        # A distance by depth holds the error of the depths' scale itself: the frames' depths confirm it.
+        scale_std = options.depth_scale_std if known.depth_scale is None else 0.0
         self._views = ViewSet(self.estimator, view, options, scale_std)
         self._jumps = JumpDetector(view.points.rest, float(np.linalg.norm(np.ptp(self.model.nodes, axis=0))))
         self._anchoring = Anchoring(self.estimator, view, options)
