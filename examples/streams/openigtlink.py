@@ -5,6 +5,7 @@
 with the address that `morph` printed. It listens at this computer's port 18944, where an OpenIGTLink client connects.
 Lengths are in millimetres. OBJECT has the surface in the object's frame, with the value at each vertex in the unit that
 people read; OBJECT_pose takes it into the camera's frame. Structures inside have their own names, and the same frame.
+Names longer than OpenIGTLink allows are cut, and numbered where two would be the same.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ PATIENCE = 2.0
 #: Of the header: version, type, device, seconds and their fraction, size and check sum of the body.
 HEADER = struct.Struct(">H12s20sIIQQ")
 VERSION = 1
+#: Bytes in the name of a device.
+MOST_BYTES = 20
 #: An attribute of points with one component.
 SCALAR = 0
 
@@ -52,10 +55,10 @@ def crc64(data: bytes) -> int:
 
 
 def packed(kind: str, device: str, body: bytes, seconds: float) -> bytes:
-    """A message of version 1 with its header; a device has 20 characters at most."""
+    """A message of version 1 with its header; a device's name has `MOST_BYTES` at most."""
     whole = int(seconds)
     fraction = int((seconds - whole) * 2**32)
-    name = device.encode()[:20]
+    name = device.encode()
     return HEADER.pack(VERSION, kind.encode(), name, whole, fraction, len(body), crc64(body)) + body
 
 
@@ -85,6 +88,32 @@ def polydata_body(points: NDArray, triangles: NDArray, name: str = "", values: N
     return body + struct.pack(">BBI", SCALAR, 1, len(values)) + text + padding + values.astype(">f4").tobytes()
 
 
+def device_names(scene: dict[str, Any]) -> dict[tuple[str, ...], str]:
+    """The devices of a stream, no two of one name: a client takes these for one and the same.
+
+    Returns
+    -------
+    By (object,), (object, "pose") and (object, "inner", structure).
+    """
+    found: dict[tuple[str, ...], str] = {}
+    for known in scene["objects"]:
+        name = known["name"]
+        inner = {(name, "inner", structure): (structure, "") for structure in known["inner"]}
+        wanted = {(name,): (name, ""), (name, "pose"): (name, "_pose"), **inner}
+        for key, (stem, ending) in wanted.items():
+            device, number = _cut(stem, ending), 1
+            while device in found.values():
+                number += 1
+                device = _cut(stem, f"_{number}{ending}")
+            found[key] = device
+    return found
+
+
+def _cut(stem: str, ending: str) -> str:
+    """A name that fits, of whole letters."""
+    return stem.encode()[: MOST_BYTES - len(ending)].decode(errors="ignore") + ending
+
+
 def frame_messages(scene: dict[str, Any], frame: dict[str, Any]) -> bytes:
     """TRANSFORM of each object that is not lost, and POLYDATA of each whose shape is known and of what it has inside.
 
@@ -93,13 +122,13 @@ def frame_messages(scene: dict[str, Any], frame: dict[str, Any]) -> bytes:
     scene : message of a stream.
     frame : message of the same stream.
     """
-    seconds, parts = frame["captured"] or frame["timestamp"], []
+    seconds, parts, devices = frame["captured"] or frame["timestamp"], [], device_names(scene)
     for known, now in zip(scene["objects"], frame["objects"], strict=True):
         name = now["name"]
         if now["camera_from_object"] is not None:
             matrix = np.array(now["camera_from_object"])
             matrix[:3, 3] *= 1e3
-            parts.append(packed("TRANSFORM", f"{name[:15]}_pose", transform_body(matrix), seconds))
+            parts.append(packed("TRANSFORM", devices[name, "pose"], transform_body(matrix), seconds))
         if (vertices := frame["arrays"].get(f"{name}/vertices")) is None:
             continue
         triangles = scene["arrays"][f"{name}/triangles"].reshape(-1, 3)
@@ -107,12 +136,14 @@ def frame_messages(scene: dict[str, Any], frame: dict[str, Any]) -> bytes:
         if values is not None:
             label, values = known["scalar"]["name"], values / known["scalar"]["shown_factor"]
         body = polydata_body(1e3 * vertices.reshape(-1, 3), triangles, label, values)
-        parts.append(packed("POLYDATA", name, body, seconds))
+        parts.append(packed("POLYDATA", devices[name,], body, seconds))
         for inner in known["inner"]:
             array = f"{name}/inner/{inner}"
             vertices = frame["arrays"][f"{array}/vertices"].reshape(-1, 3)
             triangles = scene["arrays"][f"{array}/triangles"].reshape(-1, 3)
-            parts.append(packed("POLYDATA", inner, polydata_body(1e3 * vertices, triangles), seconds))
+            parts.append(
+                packed("POLYDATA", devices[name, "inner", inner], polydata_body(1e3 * vertices, triangles), seconds)
+            )
     return b"".join(parts)
 
 

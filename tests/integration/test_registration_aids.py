@@ -229,13 +229,25 @@ def test_a_board_is_printed_in_its_size(tmp_path, suffix, capsys):
         assert apart == pytest.approx(dots, rel=0.005)
 
 
-@pytest.mark.parametrize("printed", [lambda board: board, turned_tags], ids=["OpenCV's tags", "AprilTag's"])
-def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed, refused, capsys):
-    board = printed(load_board(written(tmp_path, GRID)))
+#: Seen so, the other order of its tags' corners has no pose at all.
+FEW_TAGS = GRID.replace("columns = 4\nrows = 3", "columns = 3\nrows = 2").replace("30\ngap_mm = 9", "35\ngap_mm = 10")
+
+
+@pytest.mark.parametrize(
+    ("text", "printed", "angles"),
+    [
+        (GRID, lambda board: board, (-0.3, 0.0, 0.3)),
+        (GRID, turned_tags, (-0.3, 0.0, 0.3)),
+        (FEW_TAGS, lambda board: board, (0.6, 0.45, 0.3)),
+    ],
+    ids=["OpenCV's tags", "AprilTag's", "few tags"],
+)
+def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, text, printed, angles, refused, capsys):
+    board = printed(load_board(written(tmp_path, text)))
     world = SimilarityTransform(3.7, rotation_exp(np.array([0.4, -0.9, 1.3])), np.array([0.5, -1.2, 2.0]))
     rigid_map = RigidMap()
     rigid_map.add_points(np.zeros((1, 3)), np.zeros((1, 2)), 0, GOOD)
-    for k, angle in enumerate((-0.3, 0.0, 0.3)):
+    for k, angle in enumerate(angles):
         pose = RigidTransform(rotation_exp(np.array([0.2, angle, 0.1])) @ BOARD_POSE.rotation, BOARD_POSE.translation)
         rotation = pose.rotation @ world.rotation.T
         view = np.eye(4)
@@ -252,6 +264,7 @@ def test_a_board_in_a_map_tells_the_unit_and_the_place(tmp_path, scene, printed,
     said = dict(pair.split("=") for pair in line.split())
     assert float(said["map_units_per_metre"]) == pytest.approx(3.7, rel=2e-3)
     assert list(said)[1:] == ["rms_px", "place_std_mm", "angle_std_deg", "ambiguous"]
+    assert said["ambiguous"] == "no"
     placed = load_registration(tmp_path / "place" / "registration.json", scene.model)
     assert placed.facts["map_units_per_metre"] == pytest.approx(3.7, rel=2e-3)
     turn = Rotation.from_euler("xyz", [10, 5, 30], degrees=True).as_matrix()

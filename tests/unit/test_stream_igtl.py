@@ -47,6 +47,21 @@ def test_messages_are_byte_for_byte_those_of_another_library():
     assert sample.packed("POLYDATA", "seal", sample.polydata_body(POINTS, TRIANGLES), seconds) == surface
 
 
+def test_no_two_devices_have_one_name_nor_one_that_is_too_long():
+    """A client would take them for one. 3D Slicer's are known by their names alone, of 20 bytes."""
+    fingers = ["pneumatic_finger_left", "pneumatic_finger_right", "leber_gr\u00f6\u00dfe_links_x"]
+    objects = [{"name": name, "inner": ["vessel", "vessel_of_the_other_kind"]} for name in fingers]
+    found = sample.device_names({"objects": objects})
+    assert len(found) == len(set(found.values())) == 4 * len(fingers)
+    for key, device in found.items():
+        assert len(device.encode()) <= 20
+        assert device[:6] == key[-1][:6] if "inner" in key else device[:4] == key[0][:4]
+        assert device.endswith("_pose") == (key[-1] == "pose")
+    first = found["pneumatic_finger_left",]
+    assert first == "pneumatic_finger_lef"
+    assert sample.packed("TRANSFORM", first, b"", 0.0)[14:34] == first.encode()
+
+
 class PolyData(igtl.MessageBase):
     """POLYDATA read by the published format; the library's own reader does not work yet."""
 

@@ -243,7 +243,9 @@ def register_board(scene: Scene, model: ReducedModel, board: FiducialBoard | str
     }
     keyframes = [KeyframePose(view.frame, camera_from_object(view, placed)) for view in views]
     in_map = MapRegistration(placed, mean_node, _about(found.covariance, arm))
-    warnings = [Ambiguous(Ambiguity.BOARD_TAGS)] if found.open_order else []
+    warnings: list[RegistrationWarning] = [AssumedUndeformed()]
+    if found.open_order:
+        warnings.append(Ambiguous(Ambiguity.BOARD_TAGS))
     return registration_in_map(model, in_map, keyframes, facts, warnings, scene=scene)
 
 
@@ -279,7 +281,9 @@ def _find_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) ->
         )
     variance = max(float(misfit @ misfit) / max(len(misfit) - 7, 1), LEAST_CORNER_PX**2)
     covariance = variance * np.linalg.pinv(found.jac.T @ found.jac) * np.outer(units, units)
-    open_order = any(_fits_as_well(_total_cost(other), _total_cost(best)) for other in others)
+    # An order that has no pose in some of the keyframes does not fit there.
+    as_many = [other for other in others if len(other) == len(best)]
+    open_order = any(_fits_as_well(_total_cost(other), _total_cost(best)) for other in as_many)
     world = moved_similarity(start, found.x * units, centre)
     return _BoardInMap(world, covariance, centre, len(seen), rms, open_order)
 

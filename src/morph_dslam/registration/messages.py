@@ -351,7 +351,9 @@ class WrongUnit(RegistrationWarning):
 class AssumedUndeformed(RegistrationWarning):
     """A board says where the object is, not how it is deformed."""
 
-    template: ClassVar[str] = "registered by a board: the object is taken to be undeformed in the reference frame"
+    template: ClassVar[str] = (
+        "registered by a board, which says where the object is, not how it is deformed: it is taken to be undeformed"
+    )
 
 
 @dataclass(frozen=True)

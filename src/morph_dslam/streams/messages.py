@@ -29,7 +29,7 @@ class ParameterInfo:
     description : for people.
     unit : of its values, SI: "m", "rad", "Pa", "1" ...
     shown_unit : in which people read it, "mm" say.
-    shown_factor : a value in the shown unit is that in SI times this.
+    shown_factor : a value in the shown unit is that in SI divided by this.
     lower : lower end of its range.
     upper : upper end.
     """
@@ -52,7 +52,7 @@ class ScalarInfo:
     name : "von Mises stress", "equivalent strain", "displacement" or "traction of unknown loads".
     unit : of its values, SI.
     shown_unit : in which people read it.
-    shown_factor : a value in the shown unit is that in SI times this.
+    shown_factor : a value in the shown unit is that in SI divided by this.
     low : where colours begin.
     high : where colours end; single values may be larger.
     """
