@@ -11,6 +11,7 @@ from morph_dslam.errors import ArgumentError, CameraError, RegistrationError, So
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter
 from morph_dslam.registration.registration import Registration
+from morph_dslam.registration.starts import mirrored_tilt
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
@@ -61,6 +62,27 @@ def test_moving_bending_sheet_is_followed_within_a_fraction_of_a_millimetre(mode
     assert errors[-1] < 0.3e-3  # nothing has accumulated
     # The stated deviations are of the right size (systematic errors of the matching come on top).
     assert np.median(deviations) < 4.0
+
+
+@pytest.mark.parametrize("distance", [1.2, 2.0])
+def test_a_tilt_that_was_taken_for_its_mirror_image_is_left(distance):
+    """From afar a flat object that is tilted to either side looks nearly the same: it stayed 115 mm off."""
+    model = bent_sheet_model(22, 16)
+    film = SheetFilm(model)
+
+    def state(number):
+        turn = rotation_exp(np.array([0.1, 0.5 + 0.02 * number, 0.1 * number])) @ UPRIGHT
+        parameters = np.array([0.02 + 0.005 * number, 0.1, 0.05])
+        return State(parameters, RigidTransform(turn, np.array([0.01 * number, 0.0, distance])))
+
+    tracker = Tracker(model, CAMERA, Registration(model, state(0)), reference=film.frame(state(0)))
+    found = tracker.track(film.frame(state(1))).estimate.state
+    wrong = mirrored_tilt(model.positions(found.parameters), found.camera_from_object)
+    tracker.continue_from(replace(found, camera_from_object=wrong))
+    assert mean_error(model, tracker.state, state(1)) > 50e-3
+    for number in range(2, 5):
+        result = tracker.track(film.frame(state(number)))
+        assert mean_error(model, result.estimate.state, state(number)) < 8e-3
 
 
 def test_points_behind_an_occluder_are_rejected_and_come_back(model, film):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.registration.starts import shape_starts
+from morph_dslam.registration.starts import mirrored_tilt, shape_starts
 from morph_dslam.timing import stage
 from morph_dslam.tracking.compact_loads import LEAST_GAIN
 from morph_dslam.tracking.covariance import trace_of_share
@@ -226,7 +226,7 @@ class FrameEstimation:
             return attempt
         off_bound = self._search.off_bound(estimate)
         if estimate.sigma_px > self._options.search_above_px or self._loads_hide_much(attempt):
-            starts = [*off_bound, *self._search.spread(estimate, self._options.searches)]
+            starts = [*off_bound, *self._search.spread(estimate, self._options.searches), *self._tilted_back(attempt)]
             if self._study_scout is not None:
                 return self._with_other_loads(attempt, self._by_study_alone(self._study_scout, attempt, starts))
             return self.best_of(attempt, starts)
@@ -235,6 +235,14 @@ class FrameEstimation:
             return attempt
         # A wrong shape may fit nearly as well at first, such as that of a load that has not yet made a contact.
         return self.best_of(attempt, self._search.spread(attempt.estimate, 1), MUCH_BETTER)
+
+    def _tilted_back(self, attempt: PoseHypothesis) -> list[State]:
+        """The state with the tilt reversed, which looks alike from afar; none where something else knows the pose."""
+        if attempt.prior is not None:
+            return []
+        points, state = self._reference.points, attempt.estimate.state
+        positions = points.rest + points.field.value(state.parameters)
+        return [replace(state, camera_from_object=mirrored_tilt(positions, state.camera_from_object))]
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
         """Whether unknown loads take up more of the image than is left: then they may do what a parameter should."""
