@@ -420,8 +420,8 @@ def impatient(monkeypatch):
 
 
 @pytest.mark.usefixtures("impatient")
-def test_a_camera_on_the_network():
-    """Pictures as motion JPEG over HTTP, as network cameras send them; then silence."""
+def test_a_camera_on_the_network(capfd):
+    """Pictures as motion JPEG over HTTP, as network cameras send them; then silence, of which OpenCV says nothing."""
     server = Served(motion_jpeg(range(0, 240, 2)))
     try:
         with open_live(f"http://user:secret@{server.address}/video") as camera:
@@ -433,6 +433,7 @@ def test_a_camera_on_the_network():
         server.close()
     assert levels
     assert levels == sorted(set(levels))
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("impatient")

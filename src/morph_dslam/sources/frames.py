@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -250,16 +251,23 @@ def open_capture(source: str | int, is_remote: bool = False) -> cv2.VideoCapture
     """
     # FFmpeg's log level AV_LOG_QUIET; it is read once, when the first video is opened.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    # Until 4.12 these functions were OpenCV's own, since then they are in a module.
-    log: Any = getattr(cv2.utils, "logging", cv2)
-    before = log.getLogLevel()
-    log.setLogLevel(0)
-    try:
+    with quiet_opencv():
         if not is_remote:
             return cv2.VideoCapture(source)
         limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
         parameters = [number for limit in limits for number in (limit, NETWORK_TIMEOUT_MS)]
         return cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, parameters)
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Keep away what OpenCV prints: a message of the program's own follows."""
+    # Until 4.12 these functions were OpenCV's own, since then they are in a module.
+    log: Any = getattr(cv2.utils, "logging", cv2)
+    before = log.getLogLevel()
+    log.setLogLevel(0)
+    try:
+        yield
     finally:
         log.setLogLevel(before)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError
 from morph_dslam.sources import frames as limits
-from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, has_registered_depth, open_capture
+from morph_dslam.sources.frames import Frame, FrameStream, frame_rate, has_registered_depth, open_capture, quiet_opencv
 from morph_dslam.sources.steady_times import SteadyTimes
 
 _LOG = logging.getLogger("morph_dslam")
@@ -169,7 +169,8 @@ class LiveCamera(LiveStream):
     def read(self) -> Iterator[Frame]:
         index, start, now, times = 0, 0.0, 0.0, SteadyTimes()
         while not self.closing:
-            delivered, image = self._capture.read()
+            with quiet_opencv():  # it says when a camera on the network has been silent for too long
+                delivered, image = self._capture.read()
             if not delivered or image is None:
                 after = f"after frame {index - 1}" if index else "before the first frame"
                 what = f"{self.name} stopped delivering {after}"
@@ -201,7 +202,8 @@ class LiveCamera(LiveStream):
             self._capture.release()
             self._capture = self._reopen()
             if self._capture.isOpened():
-                delivered, image = self._capture.read()
+                with quiet_opencv():
+                    delivered, image = self._capture.read()
                 if delivered and image is not None:
                     return image
             time.sleep(AGAIN_S)
