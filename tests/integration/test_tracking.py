@@ -11,12 +11,12 @@ from morph_dslam.errors import ArgumentError, CameraError, RegistrationError, So
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import Parameter
 from morph_dslam.registration.registration import Registration
-from morph_dslam.registration.starts import mirrored_tilt
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.other_tilt import mirrored_tilt
 from morph_dslam.tracking.outcomes import BlurredByMotion, DepthNotUsed, KnownRefuted, ReferenceBlurred, RejectionReason
 from morph_dslam.tracking.result import STAGES
 from morph_dslam.tracking.session import Session

@@ -9,7 +9,7 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.registration import PosePrior
-from morph_dslam.registration.starts import mirrored_tilt, shape_starts
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, State
 from morph_dslam.tracking.frame_estimation import (
     ShapeSearch,
@@ -54,24 +54,6 @@ def test_a_mirrored_bend_is_left_by_way_of_another_start():
     starts = ShapeSearch(model, 4).spread(determined(model), 4)
     best = estimator.estimate_from(points, pixels, weights, starts)[0]
     np.testing.assert_allclose(best.state.parameters, truth.parameters, atol=5e-3)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_flat_points_in_the_mirrored_tilt_look_alike_from_afar(seed):
-    """Depths beside the mean are reversed, which a camera far away on the sight line to the mean does not see."""
-    rng = np.random.default_rng(seed)
-    flat = RigidTransform(rotation_exp(rng.standard_normal(3)), rng.standard_normal(3))
-    points = flat.apply(np.column_stack([rng.uniform(-0.1, 0.1, (20, 2)), np.zeros(20)]))
-    pose = RigidTransform(rotation_exp(rng.standard_normal(3)), np.array([0.2, -0.3, 1.0]) + rng.standard_normal(3))
-    other = mirrored_tilt(points, pose)
-    assert np.linalg.det(other.rotation) == pytest.approx(1.0)
-    before, after = pose.apply(points), other.apply(points)
-    centre = before.mean(axis=0)
-    sight = centre / np.linalg.norm(centre)
-    np.testing.assert_allclose((after - centre) @ sight, -(before - centre) @ sight, atol=1e-12)
-    across = np.eye(3) - np.outer(sight, sight)
-    np.testing.assert_allclose((after - centre) @ across, (before - centre) @ across, atol=1e-12)
-    np.testing.assert_allclose(mirrored_tilt(points, other).matrix, pose.matrix, atol=1e-9)
 
 
 def test_only_undetermined_parameters_return_to_their_default():

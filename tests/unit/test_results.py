@@ -32,6 +32,7 @@ from morph_dslam.tracking.outcomes import (
     RejectionReason,
     SamePlace,
     Status,
+    TiltAmbiguous,
     TimeOutside,
 )
 from morph_dslam.tracking.result import STAGES, FrameResult
@@ -150,6 +151,7 @@ def test_summary_counts_and_flags():
 PER_FRAME = [
     (ObjectMoved(), RunWarning.MOVED),
     (FewPointsAgree(0.5), RunWarning.FEW_AGREE),
+    (TiltAmbiguous(0.3, 40.0), RunWarning.TILT_AMBIGUOUS),
     (BlurredByMotion(9.0), RunWarning.BLURRED_BY_MOTION),
     (ReferenceBlurred(9.0), RunWarning.REFERENCE_BLURRED),
     (SamePlace("twin"), RunWarning.SAME_PLACE),

@@ -87,26 +87,3 @@ def _in_front(points: Array, rotations: Sequence[Any], translations: Sequence[An
         for r, t in zip(rotations, translations, strict=True)
     ]
     return [pose for pose in poses if (pose.apply(points)[:, 2] > 0.0).all()]
-
-
-def mirrored_tilt(points: Array, pose: RigidTransform) -> RigidTransform:
-    """The pose in which flat points look the same from afar: tilted as much, the other way.
-
-    Their depths beside that of their mean are reversed, which only perspective shows (Oberkampf, DeMenthon and Davis,
-    Computer Vision and Image Understanding 63, 1996). The mirror image of points in a plane is a rotation of them.
-
-    Parameters
-    ----------
-    points : (p, 3) in the object; the direction in which they are spread least takes the place of a plane's normal.
-    pose : camera from object.
-    """
-    centre = points.mean(axis=0)
-    at = pose.apply(centre)
-    sight, normal = at / np.linalg.norm(at), np.linalg.svd(points - centre, full_matrices=False)[2][2]
-    rotation = _mirror(sight) @ pose.rotation @ _mirror(normal)
-    return RigidTransform(rotation, at - rotation @ centre)
-
-
-def _mirror(direction: Array) -> Array:
-    """The matrix (3, 3) that reverses a direction of length one."""
-    return np.eye(3) - 2.0 * np.outer(direction, direction)

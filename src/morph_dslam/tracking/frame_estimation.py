@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.registration.starts import mirrored_tilt, shape_starts
+from morph_dslam.registration.starts import shape_starts
 from morph_dslam.timing import stage
 from morph_dslam.tracking.compact_loads import LEAST_GAIN
 from morph_dslam.tracking.covariance import trace_of_share
@@ -31,6 +31,7 @@ from morph_dslam.tracking.noise import (
 )
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.other_tilt import EXCLUDED, LIKELIER, find_other_tilt
 from morph_dslam.tracking.outcomes import DepthNotUsed
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
@@ -226,7 +227,7 @@ class FrameEstimation:
             return attempt
         off_bound = self._search.off_bound(estimate)
         if estimate.sigma_px > self._options.search_above_px or self._loads_hide_much(attempt):
-            starts = [*off_bound, *self._search.spread(estimate, self._options.searches), *self._tilted_back(attempt)]
+            starts = [*off_bound, *self._search.spread(estimate, self._options.searches)]
             if self._study_scout is not None:
                 return self._with_other_loads(attempt, self._by_study_alone(self._study_scout, attempt, starts))
             return self.best_of(attempt, starts)
@@ -236,13 +237,36 @@ class FrameEstimation:
         # A wrong shape may fit nearly as well at first, such as that of a load that has not yet made a contact.
         return self.best_of(attempt, self._search.spread(attempt.estimate, 1), MUCH_BETTER)
 
-    def _tilted_back(self, attempt: PoseHypothesis) -> list[State]:
-        """The state with the tilt reversed, which looks alike from afar; none where something else knows the pose."""
-        if attempt.prior is not None:
-            return []
-        points, state = self._reference.points, attempt.estimate.state
-        positions = points.rest + points.field.value(state.parameters)
-        return [replace(state, camera_from_object=mirrored_tilt(positions, state.camera_from_object))]
+    def in_likelier_tilt(self, attempt: PoseHypothesis) -> PoseHypothesis:
+        """The attempt, or a clearly likelier explanation in the mirrored tilt; with both if neither is excluded.
+
+        Where something else knows the pose there is nothing to ask.
+        """
+        if attempt.prior is not None or attempt.outline_alone or not attempt.estimate.sigma_px < np.inf:
+            return attempt
+        for measured in self._few_and_all(attempt):
+            points, n_numbers = measured[0], 2 * int(attempt.measurement.valid.sum())
+            other = find_other_tilt(
+                lambda start, measured=measured: self._scout.minimum(*measured, start),
+                points, attempt.estimate.state, n_numbers, self._reference.redundancy,
+            )  # fmt: skip
+            if other.ratio > EXCLUDED**2:
+                return attempt
+        if other.ratio < -(LIKELIER**2):
+            return self._trimmed(attempt.measurement, other.state, None)
+        return replace(attempt, other_tilt=other)
+
+    def with_other_tilt(self, attempt: PoseHypothesis) -> PoseHypothesis:
+        """The attempt with the other tilt as all that was measured has it, outline and depth too, if not excluded."""
+        if attempt.other_tilt is None or attempt.prior is not None:
+            return replace(attempt, other_tilt=None)
+        measured = self.measured(attempt, correlated=False)
+        n_numbers = int(measured.numbers[measured.weights > 0.0].sum())
+        other = find_other_tilt(
+            lambda start: self._scout.fitted(measured, start),
+            self._reference.points, attempt.estimate.state, n_numbers, self._reference.redundancy,
+        )  # fmt: skip
+        return replace(attempt, other_tilt=None if other.ratio > EXCLUDED**2 else other)
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
         """Whether unknown loads take up more of the image than is left: then they may do what a parameter should."""

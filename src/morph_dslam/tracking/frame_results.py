@@ -31,12 +31,16 @@ from morph_dslam.tracking.outcomes import (
     Rejection,
     Status,
     SurfaceJumps,
+    TiltAmbiguous,
     TrackingWarning,
 )
 from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.views import ActiveView
+
+#: The mirrored tilt is named where it is at least as probable as this, and the object turned by more, rad.
+LIKELY_TILT, MUCH_TILTED = 0.05, np.radians(5.0)
 
 
 def warnings_of_place(
@@ -113,6 +117,10 @@ def tracked_result(
     estimate, unexplained_px, more = _with_systematic_errors(hypothesis, view, past, errors)
     if hypothesis.depth_unused is not None:
         more.append(hypothesis.depth_unused)
+    if (tilt := hypothesis.other_tilt) is not None:
+        estimate = replace(estimate, covariance=estimate.covariance + tilt.spread)
+        if tilt.probability > LIKELY_TILT and tilt.angle > MUCH_TILTED:
+            more.append(TiltAmbiguous(tilt.probability, float(np.degrees(tilt.angle))))
     residuals, (n_points, n_inliers) = hypothesis.estimate.residuals[hypothesis.supporting], hypothesis.counts
     return FrameResult(
         model,

@@ -15,6 +15,7 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Measurement
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.other_tilt import OtherTilt
 from morph_dslam.tracking.outcomes import DepthNotUsed, Rejection, RejectionReason
 from morph_dslam.tracking.outline import OutlineMeasurement
 from morph_dslam.tracking.outline_weight import MEDIAN_OF_NUMBER
@@ -82,6 +83,7 @@ class PoseHypothesis:
         asked after a loss only.
     blurred : (p, 2), the paths over which motion smears the points that support it, pixels, see `blurred_paths`; None
         where it does no harm, or is not known.
+    other_tilt : the mirrored tilt, where what was measured does not exclude it.
     reference_blur_px : the root mean square length of the paths over which motion smears the reference picture, pixels;
         0 where it does no harm, or is not known.
     """
@@ -97,6 +99,7 @@ class PoseHypothesis:
     discrepancy: Discrepancy | None = None
     n_absent: int = 0
     blurred: Array | None = None
+    other_tilt: OtherTilt | None = None
     reference_blur_px: float = 0.0
 
     @property

@@ -125,6 +125,22 @@ class FewPointsAgree(TrackingWarning):
 
 
 @dataclass(frozen=True)
+class TiltAmbiguous(TrackingWarning):
+    """A flat object far away may as well be tilted to the other side; deviations hold that.
+
+    Attributes
+    ----------
+    probability : that it is.
+    angle_deg : between both, degrees.
+    """
+
+    doubts_result: ClassVar[bool] = False
+    template: ClassVar[str] = "it may be tilted to the other side, {angle_deg:.0f} degrees from here: this looks alike"
+    probability: float
+    angle_deg: float
+
+
+@dataclass(frozen=True)
 class BlurredByMotion(TrackingWarning):
     """Motion blurs the picture: points are measured somewhere on their paths during the exposure, at no one instant.
 

@@ -30,6 +30,7 @@ from morph_dslam.tracking.outcomes import (
     ReferenceBlurred,
     SamePlace,
     Status,
+    TiltAmbiguous,
     TimeOutside,
     TrackingWarning,
 )
@@ -59,6 +60,11 @@ class RunWarning(StrEnum):
         "few points agree, and less closely than usual, in {count} of {n_frames} frames, first in frame {first}: "
         "something is before the object, it deforms otherwise than the model, or it was taken for what looks like it; "
         "do not rely on these frames"
+    )
+    TILT_AMBIGUOUS = (
+        "in {count} of {n_frames} frames, first in frame {first}, the object may as well be tilted to the other side, "
+        "by up to {largest_deg:.0f} degrees from the pose found: a flat object far away looks alike; deviations there "
+        "hold that; film it from nearer, or with depth"
     )
     BLURRED_BY_MOTION = (
         "motion blurs the pictures in {count} of {n_frames} frames, first in frame {first}, over paths of up to "
@@ -254,6 +260,8 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     if 2 * len(without_rows) > len(run):
         tell(without_rows, kind.READOUT_NOT_USED)
     tell(_warned(run, FewPointsAgree), kind.FEW_AGREE)
+    tilted = _warned(run, TiltAmbiguous)
+    tell(tilted, kind.TILT_AMBIGUOUS, largest_deg=max((warning.angle_deg for _, warning in tilted), default=0.0))
     blurred = _warned(run, BlurredByMotion)
     longest = max((warning.path_px for _, warning in blurred), default=0.0)
     tell(blurred, kind.BLURRED_BY_MOTION, largest_px=longest)

@@ -335,9 +335,10 @@ class Tracker:
         return hypothesis
 
     def _search(self, hypothesis: PoseHypothesis) -> PoseHypothesis:
-        """Try other shapes where the residuals are large, lest the estimate stay in a local minimum."""
+        """Try other shapes where the residuals are large, and the mirrored tilt, lest it stay in a local minimum."""
         with stage("search"):
-            return self._view.estimation.search_other_shapes(hypothesis)
+            estimation = self._view.estimation
+            return estimation.in_likelier_tilt(estimation.search_other_shapes(hypothesis))
 
     def _check_map(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
         """Go by the points alone where they are not where the map has the object."""
@@ -383,6 +384,8 @@ class Tracker:
             hypothesis = estimation.fit_outline(image, hypothesis)
         with stage("depth"):
             hypothesis = estimation.fit_depths(image, hypothesis)
+        with stage("search"):
+            hypothesis = estimation.with_other_tilt(hypothesis)
         with stage("fuse"):
             self.last_measured = measured = estimation.measured(hypothesis)
             estimate = self._filter.fuse(measured, hypothesis.estimate, hypothesis.prior)

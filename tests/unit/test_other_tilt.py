@@ -1,0 +1,90 @@
+"""The mirrored tilt of a flat object far away: how often it is the right one, against what is stated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
+from morph_dslam.tracking.other_tilt import OtherTilt, find_other_tilt, mirrored_tilt
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points
+from tests.support.rendered_sequence import CAMERA, UPRIGHT
+
+MODEL = bent_sheet_model(8, 6)
+FLAT = np.zeros(3)
+NOISE_PX, COUNT = 0.3, 40
+
+
+def rigid_estimator():
+    """It stays flat."""
+    estimator = Estimator(MODEL, CAMERA, EstimationOptions(max_iterations=40, tolerance=1e-8))
+    return estimator.within(replace(estimator.box, lower=FLAT, upper=FLAT))
+
+
+def tilts(rng, distance, tilt):
+    """The truth, the estimate from one of both tilts at random, and the other one."""
+    points, estimator = bound_points(MODEL, COUNT, rng), rigid_estimator()
+    turn = rotation_exp(np.array([0.05, tilt, 0.1])) @ UPRIGHT
+    truth = State(FLAT, RigidTransform(turn, np.array([0.1, -0.05, distance])))
+    pixels = CAMERA.project(points.in_camera(truth)) + NOISE_PX * rng.standard_normal((COUNT, 2))
+
+    def minimum(start):
+        return estimator.minimum(points, pixels, np.ones(COUNT), start)
+
+    start = truth
+    if rng.random() < 0.5:
+        start = replace(truth, camera_from_object=mirrored_tilt(MODEL.nodes, truth.camera_from_object))
+    found = minimum(start).state
+    return truth, found, find_other_tilt(minimum, points, found, 2 * COUNT, 1.0)
+
+
+def angle(one, other):
+    turned = one.camera_from_object.rotation @ other.camera_from_object.rotation.T
+    return np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_flat_points_in_the_mirrored_tilt_look_alike_from_afar(seed):
+    """Depths beside the mean are reversed, which a camera far away on the sight line to the mean does not see."""
+    rng = np.random.default_rng(seed)
+    flat = RigidTransform(rotation_exp(rng.standard_normal(3)), rng.standard_normal(3))
+    points = flat.apply(np.column_stack([rng.uniform(-0.1, 0.1, (20, 2)), np.zeros(20)]))
+    pose = RigidTransform(rotation_exp(rng.standard_normal(3)), np.array([0.2, -0.3, 1.0]) + rng.standard_normal(3))
+    other = mirrored_tilt(points, pose)
+    assert np.linalg.det(other.rotation) == pytest.approx(1.0)
+    before, after = pose.apply(points), other.apply(points)
+    centre = before.mean(axis=0)
+    sight = centre / np.linalg.norm(centre)
+    np.testing.assert_allclose((after - centre) @ sight, -(before - centre) @ sight, atol=1e-12)
+    across = np.eye(3) - np.outer(sight, sight)
+    np.testing.assert_allclose((after - centre) @ across, (before - centre) @ across, atol=1e-12)
+    np.testing.assert_allclose(mirrored_tilt(points, other).matrix, pose.matrix, atol=1e-9)
+
+
+@pytest.mark.parametrize(("distance", "share"), [(3.0, 0.0), (6.0, 0.1), (9.0, 0.75)])
+def test_the_other_tilt_is_as_often_the_right_one_as_stated(distance, share):
+    """``share`` is about how often neither is likely enough to rely on."""
+    rng, stated, right = np.random.default_rng(int(distance)), [], []
+    for _ in range(200):
+        truth, found, other = tilts(rng, distance, rng.uniform(0.3, 0.6))
+        stated.append(other.probability)
+        right.append(angle(other.state, truth) < angle(found, truth))
+    stated, right = np.array(stated), np.array(right)
+    # One in a thousand is off by more than 3.3 of the binomial's deviations; 1 % for what is not Gaussian.
+    spread = np.sqrt(np.sum(stated * (1.0 - stated))) / len(stated)
+    assert right.mean() == pytest.approx(stated.mean(), abs=3.3 * spread + 0.01)
+    unsure = np.mean((stated > 0.05) & (stated < 0.95))
+    assert unsure == pytest.approx(share, abs=0.1)
+
+
+def test_the_covariance_is_that_of_two_modes():
+    """Of values at 0 and at d, with probabilities 1 - p and p: p (1 - p) d d'."""
+    apart = np.array([0.0, 0.3, -0.2, 0.1, 0.01, 0.0, 0.02])
+    other = OtherTilt(State(np.zeros(1), RigidTransform.identity()), apart, ratio=2.0 * np.log(3.0))
+    assert other.probability == pytest.approx(0.25)
+    values = np.random.default_rng(0).choice([0.0, 1.0], 100_000, p=[0.75, 0.25])[:, None] * apart
+    np.testing.assert_allclose(other.spread, np.cov(values.T), atol=2e-3)
+    assert other.angle == pytest.approx(np.linalg.norm(apart[1:4]))
+    assert replace(other, ratio=1e5).spread.max() < 1e-100
