@@ -72,10 +72,13 @@ def test_the_order_enters_the_fingerprint_where_there_is_one() -> None:
         strip_study(True, supports=[{"kind": "fixed", "on": "x_min", "first": True}])
 
 
-def held_bar(rest: str | None, stretch: str = "0.2 mm", first: bool = True, part: float | str = 0.6) -> SolidStudy:
+def held_bar(
+    rest: str | None, stretch: str = "0.2 mm", first: bool = True, part: float | str = 0.6, **of_time: Any
+) -> SolidStudy:
     """A viscoelastic bar, stretched first, whose end then moves sideways; ``part`` of its stiffness relaxes."""
     stretched = {"kind": "displacement", "on": "x_max", "x": stretch, "first": first}
-    time = {"parameter": "age", "step": "0.5 s"} | ({"rest": rest} if rest else {})
+    begin = of_time.pop("begin", "0 s")
+    time = {"parameter": "age", "step": "0.5 s"} | of_time | ({"rest": rest} if rest else {})
     prony = {"relative_moduli": [part], "times": ["2 s"]}
     return strip_study(
         False,
@@ -89,7 +92,7 @@ def held_bar(rest: str | None, stretch: str = "0.2 mm", first: bool = True, part
         loads=[],
         parameters={
             "side": {"range": ["0 mm", "0.5 mm"]},
-            "age": {"range": ["0 s", "4 s"]},
+            "age": {"range": [begin, "4 s"]},
             "pull": {"range": ["0.2 mm", "4 mm"]},
             "g": {"range": [0.1, 0.8]},
         },
@@ -121,7 +124,28 @@ def test_what_rests_does_so_at_the_parameters_of_the_sample() -> None:
         assert force == pytest.approx(16e-6 * 1.5e6 * (stretch - 1.0 / stretch) * left, rel=1e-8)
 
 
+def test_what_has_rested_moves_on_with_an_amplitude() -> None:
+    """One support stretches a bar, rests and moves: S = P / s is the convolution of E / 2 (1 - 1 / s^2)."""
+    wave = {"wave": {"times": ["0 s", "1 s", "4 s"], "values": [0.0, 1.0, 0.25]}}
+    study = held_bar("3 s", stretch="0.2 mm + pull * wave", step="0.025 s", amplitudes=wave)
+    sweep, pull = study.sweep_problem(), 3e-3
+    # The bar has been held for three seconds when the time begins.
+    time = np.linspace(-3.0, 4.0, 70001)
+    stretch = 1.0 + (0.2e-3 + pull * np.interp(time, [0.0, 1.0, 4.0], [0.0, 1.0, 0.25])) / 0.02
+    at_once = 1.5e6 * (1.0 - stretch**-2)
+    for age in (0.0, 1.0, 4.0):
+        until = time <= age + 1e-9
+        faded = np.exp((time[until] - age) / 2.0)
+        grown = at_once[0] * faded[0] + np.sum(np.diff(at_once[until]) * 0.5 * (faded[1:] + faded[:-1]))
+        expected = 16e-6 * stretch[until][-1] * (0.4 * at_once[until][-1] + 0.6 * grown)
+        state = sweep.advance(sweep.first_state(), np.array([0.0, age, pull, 0.6]))
+        assert sweep.take_snapshot(state).outputs["force_x_max"][0] == pytest.approx(expected, rel=2e-4)
+
+
 def test_mistakes_in_a_rest_are_named() -> None:
+    early = {"wave": {"times": ["0 s", "2 s"], "values": [0.0, 1.0]}}
+    with pytest.raises(StudyError, match=r"'0.2 mm \* wave' rests .*: let its times begin at 1 s or later"):
+        held_bar("3 s", stretch="0.2 mm * wave", amplitudes=early, begin="1 s")
     with pytest.raises(StudyError, match=r"'0.2 mm \* age / 1 s' names the time, but rests before the time begins"):
         held_bar("3 s", stretch="0.2 mm * age / 1 s")
     with pytest.raises(StudyError, match=r"time\.rest: nothing rests"):

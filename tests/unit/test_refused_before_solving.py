@@ -41,7 +41,15 @@ CLAMPED = SHELL["supports"]
 SPHERE = {"kind": "sphere", "on": "z_max", "centre": ["10 mm", "10 mm", "45 mm"]}
 CYLINDER = {"kind": "cylinder", "on": "z_max", "point": ["10 mm", "10 mm", "45 mm"], "axis": [1, 0, 0]}
 PATCH = {"kind": "moving_patch", "on": "z_max", "force": ["0 N", "0 N", "-1 N"], "centre": ["p", "10 mm", "20 mm"]}
+LIFTED = {"kind": "displacement", "on": "z_max", "z": "p"}
 LINE = PATCH | {"kind": "moving_line", "direction": [0, 1, 0], "force": ["0 N/m", "0 N/m", "-1 N/m"]}
+
+
+HALVES = {
+    "near": {"of": "z_max", "box": [["0 mm", "0 mm", "0 mm"], ["10 mm", "20 mm", "20 mm"]]},
+    "far": {"of": "z_max", "box": [["10 mm", "0 mm", "0 mm"], ["20 mm", "20 mm", "20 mm"]]},
+}
+HELD_HALVES = [{"kind": "displacement", "on": name, "z": "0 mm"} for name in HALVES]
 
 
 def clock(*ends: str, step: str = "1 s", **more: str) -> dict[str, Any]:
@@ -191,6 +199,23 @@ def prepared(study: Study) -> None:
             SOLID | {"shape": [{"kind": "thickness", "on": "z_max", "kept": "z_max", "amplitude": "p"}]},
             "shape 1: surfaces 'z_max' and 'z_max' share 25 nodes",
         ),
+        (
+            SOLID | {"supports": [*SOLID["supports"], LIFTED | {"z": "1 mm"}, LIFTED], "loads": []},
+            r"support 3: its z does nothing, because support 2 \('z_max'\), listed before it, holds z at every",
+        ),
+        (SOLID | {"supports": [*SOLID["supports"], LIFTED, LIFTED | {"z": "0 mm"}]}, "support 3: its z does nothing"),
+        (  # only y of the two is new
+            SOLID | {"supports": [*SOLID["supports"], LIFTED, LIFTED | {"y": "p", "z": "2 * p"}]},
+            "support 3: its z does nothing",
+        ),
+        (  # both halves of a top that is held
+            SOLID | {"sets": HALVES, "supports": [*SOLID["supports"], *HELD_HALVES, LIFTED]},
+            r"support 4: its z does nothing, because support 2 \('near'\) and support 3 \('far'\), listed before it,",
+        ),
+        (
+            SHELL | {"supports": [*CLAMPED, {"kind": "displacement", "on": "x_min", "z": "p"}]},
+            r"support 2: its z does nothing, because support 1 \('x_min'\)",
+        ),
     ],
 )
 def test_what_a_mesh_does_not_allow(content, message):
@@ -215,6 +240,11 @@ def test_what_a_mesh_does_not_allow(content, message):
         SHELL | {"supports": [*CLAMPED, {"kind": "symmetry", "on": "y_min", "axis": "y"}]},
         SHELL | {"sets": {"near": {"nearest": ["170 mm", "10 mm", "0 mm"]}}},
         SHELL | {"unknown_loads": {"on": "all"}},
+        # Edges that two supports share, the same motion twice, a fixed set one of whose components moves.
+        SOLID | {"supports": [*SOLID["supports"], {"kind": "displacement", "on": "x_max", "x": "p", "z": "p"}]},
+        SOLID | {"supports": [*SOLID["supports"], LIFTED, LIFTED | {"z": "0.5 * p + 0.5 * p"}]},
+        SOLID | {"supports": [*SOLID["supports"], LIFTED, {"kind": "fixed", "on": "z_max"}]},
+        SOLID | {"sets": HALVES, "supports": [*SOLID["supports"], HELD_HALVES[0], LIFTED]},
     ],
 )
 def test_right_studies_are_not_accused(content):

@@ -27,6 +27,10 @@ class Amplitude:
         """Values at times of any shape, s."""
         return np.asarray(np.interp(np.asarray(time, dtype=np.float64), self.times, self.values), dtype=np.float64)
 
+    def is_constant(self, begin: float, end: float) -> bool:
+        """Whether it has one value from ``begin`` to ``end``, s."""
+        return not np.ptp(self([begin, *(time for time in self.times if begin < time < end), end]))
+
     def relaxed(self, time: ArrayLike, start: float, relaxation_time: float) -> Array:
         """The convolution of exp(-t / relaxation_time) with what the amplitude grows by, at times (m,), s.
 

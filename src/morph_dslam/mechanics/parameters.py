@@ -86,6 +86,20 @@ class ParameterSymbols:
         for name, amplitude in self.amplitudes.items():
             self._amplitudes[name].Set(float(amplitude(self._symbols[self.clock].Get())))
 
+    def telling_states(self) -> list[Array]:
+        """States (d,) in at least one of which two different expressions have different values.
+
+        Drawn from the ranges, three or one at each end of a straight line of an amplitude: there amplitudes that differ
+        differ.
+        """
+        low, high = (np.array([getattr(p, end) for p in self.parameters]) for end in ("lower", "upper"))
+        times = [time for amplitude in self.amplitudes.values() for time in amplitude.times]
+        states = np.random.default_rng(0).uniform(low, high, (3 + len(times), len(self)))
+        if times:
+            clock = [parameter.name for parameter in self.parameters].index(self.clock)
+            states[3:, clock] = np.clip(times, low[clock], high[clock])
+        return list(states)
+
     def value(self, expression: Scalar) -> float:
         """Value of an expression that does not vary in space, at the present parameters."""
         return evaluate(expression)

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 #: A rigid motion whose held part is below this is free.
 FREE_MOTION = 1e-6
+#: Prescribed displacements that differ by less than this part of the body's size are the same.
+SAME_PLACE = 1e-9
 
 
 class Constraints:
@@ -45,23 +47,64 @@ class Constraints:
         self._constant[: space.geometry.ngs.nv] = 1.0
         held = np.zeros((3, space.n_scalar), dtype=bool)
         self._parts: list[tuple[PrescribedMotion, int, Indices]] = []
+        self._hidden: list[tuple[PrescribedMotion, int, Indices]] = []
         for motion in self._motions:
             dofs = space.dofs_on(self._mesh.set_nodes(motion.on))
             for component in np.flatnonzero(motion.components):
                 new = dofs[~held[component, dofs]]
                 held[component, new] = True
                 self._parts.append((motion, int(component), new))
+                if not len(new):
+                    self._hidden.append((motion, int(component), dofs))
         self.held: NDArray[np.bool_] = held.ravel()
 
     def values(self) -> Array:
         """(3 n_scalar,) prescribed values at the present parameters; 0 where nothing is held."""
         result = np.zeros((3, self._space.n_scalar))
-        coordinates = self._shape.coordinates(self._symbols)
         for motion, component, dofs in self._parts:
-            affine = motion.motion(self._symbols, *self._centroid(motion))
-            rigid = coordinates[dofs] @ affine.matrix[component]
-            result[component, dofs] = rigid + self._constant[dofs] * affine.shift[component]
+            result[component, dofs] = self._prescribed(motion, component, dofs)
         return result.ravel()
+
+    def _prescribed(self, motion: PrescribedMotion, component: int, dofs: Indices) -> Array:
+        """(k,) what a support prescribes for a component at k dofs, whichever support decides."""
+        affine = motion.motion(self._symbols, *self._centroid(motion))
+        rigid = self._shape.coordinates(self._symbols)[dofs] @ affine.matrix[component]
+        return np.asarray(rigid + self._constant[dofs] * affine.shift[component])
+
+    def without_effect(self) -> tuple[PrescribedMotion, list[int], list[PrescribedMotion]] | None:
+        """The first support that moves its set, by the study, where others that come before it have decided all.
+
+        Counted are components that are held at every place of the set already, and elsewhere than the support says.
+        A support of which others count may hold some at zero: so does a fixed set one of whose components is moved.
+
+        Returns
+        -------
+        The support, its components (0, 1, 2) that do nothing, and the supports that decide them; None if there is none.
+        """
+        present, states = self._symbols.present, self._symbols.telling_states()
+        tolerance = SAME_PLACE * float(np.ptp(self._mesh.nodes, axis=0).max())
+        found: dict[int, list[tuple[int, Indices]]] = {}
+        for motion, component, dofs in self._hidden:
+            differs = moves = False
+            for mu in states:
+                self._symbols.set(mu)
+                own = self._prescribed(motion, component, dofs)
+                decided = self.values().reshape(3, -1)[component, dofs]
+                differs |= bool(np.abs(own - decided).max() > tolerance)
+                moves |= bool(np.abs(own).max() > tolerance)
+            all_hidden = sum(other is motion for other, _, _ in self._hidden) == sum(motion.components)
+            if differs and (moves or all_hidden):
+                found.setdefault(self._motions.index(motion), []).append((component, dofs))
+        self._symbols.set(present)
+        if not found:
+            return None
+        index = min(found)
+        by = [
+            motion
+            for motion, component, dofs in self._parts
+            if any(component == own and np.isin(dofs, hidden).any() for own, hidden in found[index])
+        ]
+        return self._motions[index], [component for component, _ in found[index]], list(dict.fromkeys(by))
 
     def values_on_the_way(self, begin: Array, share: float) -> Array:
         """(3 n_scalar,) prescribed values on that share of the way from ``begin`` (3 n_scalar,) to `values`.

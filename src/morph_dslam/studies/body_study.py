@@ -15,7 +15,7 @@ from morph_dslam.mechanics.contact import RigidCylinder, RigidSphere
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.shell_material import ShellMaterial
-from morph_dslam.mechanics.supports import ElasticFoundation
+from morph_dslam.mechanics.supports import Constraints, ElasticFoundation
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
 from morph_dslam.model.reduced_model import state_text
@@ -182,6 +182,21 @@ def reader_of(symbols: ParameterSymbols) -> Reader:
         return read_affine(value, quantity, symbols.parameters, known).expression(values, functions)
 
     return read
+
+
+def check_effect(constraints: Constraints, supports: Sequence[Any]) -> None:
+    """Refuse a support of whose motion nothing is left, because supports listed before it decide (StudyError)."""
+    if (found := constraints.without_effect()) is None:
+        return
+    support, components, deciding = found
+    numbers = {id(part): number for number, part in enumerate(supports, start=1)}
+    named = " and ".join(f"support {numbers[id(part)]} ('{part.on}')" for part in deciding)
+    moved = ", ".join("xyz"[component] for component in components)
+    raise StudyError(
+        f"support {numbers[id(support)]}: its {moved} does nothing, because {named}, listed before it, holds {moved} "
+        f"at every place of '{support.on}': write the sum of both motions in one of them, move another set against "
+        "this one, or leave one of them out"
+    )
 
 
 def support_content(supports: Sequence[Any], mesh: Mesh) -> dict[str, str]:

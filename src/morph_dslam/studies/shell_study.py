@@ -17,6 +17,7 @@ from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.studies.body_study import (
     BodyStudy,
     NamedSet,
+    check_effect,
     check_names,
     numbered,
     read_once,
@@ -138,6 +139,7 @@ class ShellStudy(BodyStudy, Section):
 
         supports = [section.make(read) for section in self.supports]
         problem = shell(supports)
+        check_effect(problem.constraints, supports)
         problem.at_rest = partial(shell, [held_still(support) for support in supports])
         return problem
 

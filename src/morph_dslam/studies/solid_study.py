@@ -25,6 +25,7 @@ from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
 from morph_dslam.studies.body_study import (
     BodyStudy,
     NamedSet,
+    check_effect,
     check_names,
     numbered,
     read_once,
@@ -195,14 +196,25 @@ class SolidStudy(BodyStudy, Section):
         return "time starts at the lower end of its range, which cannot be below 0 s: begin it at 0 s or later"
 
     def _check_rest(self, parameters: tuple[Parameter, ...], clock: int) -> None:
-        """What rests before the time begins must be there, and cannot depend on the time."""
-        first = self._applied_first()
+        """What rests before the time begins must be there, and cannot change meanwhile."""
+        assert self.time is not None
+        first, begin, rest = self._applied_first(), parameters[clock].lower, self.time.rest or 0.0
         if not first:
             raise ValueError("time.rest: nothing rests; say of a load or support that it is first = true")
 
         def read(value: Value, quantity: str | None) -> float:
-            if clock in read_affine(value, quantity, parameters, self.amplitudes()).used:
-                raise ValueError(f"'{value}' names the time, but rests before the time begins: leave out first = true")
+            found = read_affine(value, quantity, parameters, self.amplitudes())
+            if found.slopes[clock] or any(product.index == clock for product in found.products):
+                raise ValueError(
+                    f"'{value}' names the time, but rests before the time begins: leave out first = true, or multiply "
+                    "by an amplitude, which keeps its first value until its first time"
+                )
+            for product in found.products:
+                if not product.amplitude.is_constant(begin - rest, begin):
+                    raise ValueError(
+                        f"'{value}' rests before the time begins, and the amplitude {product.name} changes meanwhile: "
+                        f"let its times begin at {begin:g} s or later, or leave out first = true"
+                    )
             return 0.0
 
         for section in first:
@@ -344,6 +356,7 @@ class SolidStudy(BodyStudy, Section):
 
         supports, loads, couplings = made(self.supports), made(self.loads), made(self.couplings)
         problem = solid(*([part for part, _ in parts] for parts in (supports, loads, couplings)))
+        check_effect(problem.constraints, [part for part, _ in supports])
         if self._applied_first():
             problem.applied_first = partial(
                 solid,
