@@ -7,6 +7,7 @@ from numba import njit
 
 #: Places in the texture are whole numbers of these parts of a pixel.
 PARTS = 256
+_OF_LEVEL = np.float32(1.0 / PARTS**2)
 
 
 @njit(cache=True, nogil=True)
@@ -27,10 +28,10 @@ def pack_texture(grey):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def grey_at(packed, x, y):
-    """Grey level of a packed texture at a place in `PARTS` of a pixel, bilinearly; outside it is its border."""
+    """Grey level of a packed texture at a place in `PARTS` of a pixel, float32, bilinear; outside it is its border."""
     column = int(min(max(x, 0.0), PARTS * (packed.shape[1] - 1)) + 0.5)
     row = int(min(max(y, 0.0), PARTS * (packed.shape[0] - 1)) + 0.5)
-    return np.uint8((interpolated(packed[row >> 8, column >> 8], column & 255, row & 255) + 32768) >> 16)
+    return np.float32(interpolated(packed[row >> 8, column >> 8], column & 255, row & 255)) * _OF_LEVEL
 
 
 @njit(cache=True, nogil=True, inline="always")

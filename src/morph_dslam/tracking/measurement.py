@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -29,11 +30,13 @@ class Rendering:
 
     Attributes
     ----------
-    image : (h, w) uint8, the contrast-normalized texture as it should appear; `NEUTRAL` off the object.
+    grey : (h, w) float32, the contrast-normalized texture as it should appear; `NEUTRAL` off the object.
+    image : (h, w) uint8, the same in whole grey levels.
     depth : (h, w) float32 metres, infinity off the object.
     triangle_ids : (h, w) int32, the triangle that a pixel sees, -1 off the object.
     """
 
+    grey: NDArray[np.float32]
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
     triangle_ids: NDArray[np.int32]
@@ -73,7 +76,7 @@ class ReferenceAppearance:
     def render(self, view: View) -> Rendering:
         """The object alone, in another view of it."""
         height, width = self._camera.height, self._camera.width
-        image = np.full((height, width), NEUTRAL, dtype=np.uint8)
+        grey = np.full((height, width), NEUTRAL, dtype=np.float32)
         depth = np.full((height, width), np.inf, dtype=np.float32)
         triangle_ids = np.full((height, width), -1, dtype=np.int32)
         draw_textured(
@@ -83,16 +86,16 @@ class ReferenceAppearance:
             self._coordinates,
             self._texture,
             self._closed,
-            image,
+            grey,
             depth,
             triangle_ids,
         )
-        return Rendering(image, depth, triangle_ids)
+        return Rendering(grey, cv2.convertScaleAbs(grey), depth, triangle_ids)  # type: ignore[arg-type]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image, depth, triangle_ids):
-    """Draw a textured surface over what is in ``image``, ``depth`` and ``triangle_ids`` already.
+def draw_textured(pixels, depths, triangles, coordinates, texture, closed, grey, depth, triangle_ids):
+    """Draw a textured surface over what is in ``grey``, ``depth`` and ``triangle_ids`` already.
 
     Parameters
     ----------
@@ -100,7 +103,7 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
     coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth
         in the camera that took it, and that depth; outside it is its border
     texture : (H, W) of `pack_texture`.
-    image, depth, triangle_ids : (h, w) uint8, float32, the unit of ``depths``, and int32; changed where the surface is
+    grey, depth, triangle_ids : (h, w) float32, float32, the unit of ``depths``, and int32; changed where the surface is
         nearest.
     """
     nodes, terms = pack_nodes(pixels, depths), np.empty((3, 4))
@@ -132,7 +135,7 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, image
                 if z < depth[row, column]:
                     depth[row, column], triangle_ids[row, column] = z, t
                     scale = 1.0 / (w + k * w_right)
-                    image[row, column] = grey_at(texture, (x + k * x_right) * scale, (y + k * y_right) * scale)
+                    grey[row, column] = grey_at(texture, (x + k * x_right) * scale, (y + k * y_right) * scale)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -250,7 +253,8 @@ def compare_with_rendering(
     def look_for(rows: NDArray[np.int64], guesses: Array, levels: int) -> None:
         places = predicted[rows]
         found, ok = follow(rendering.image, frame, places, guesses, levels)
-        found, correlation, exactness = compare_patches(rendering.image, frame, places, found, PATCH_HALF)
+        # Whole levels do not show shifts that change them by less than half of one: the state would stay there.
+        found, correlation, exactness = compare_patches(rendering.grey, frame, places, found, PATCH_HALF)
         near = np.linalg.norm(found - shown[rows], axis=1) < LARGEST_CORRECTION_PX
         ok &= near & np.isfinite(exactness) & (correlation > LEAST_CORRELATION)
         pixels[rows], valid[rows], spread[rows] = found, ok, exactness

@@ -204,7 +204,7 @@ def compare_patches(first, second, first_points, second_points, half):
 
     Parameters
     ----------
-    first, second : (h, w) uint8
+    first, second : (h, w) grey levels, uint8 or float32
     first_points : (p, 2) patch centres in the first image.
     second_points : (p, 2) in the second, by motion alone
     half : the patches are (2 half + 1) pixels wide.
