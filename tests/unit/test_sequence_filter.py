@@ -1,5 +1,6 @@
 """The filter of what is one per sequence, against the errors of simulated measurements."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ from morph_dslam.registration.registration import PosePrior
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
 from morph_dslam.tracking.noise import block_diagonal, window_correlation
 from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
+from morph_dslam.tracking.still import held
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
 from tests.support.rendered_sequence import CAMERA
@@ -120,6 +122,25 @@ def test_pose_that_is_held_is_not_said_to_be_better_known():
         np.testing.assert_allclose(fused.state.camera_from_object.matrix, state.camera_from_object.matrix, atol=1e-5)
         np.testing.assert_allclose(fused.pose_std, np.sqrt(np.diag(lasting**2 + anew**2)), rtol=0.01)
         assert np.linalg.eigvalsh(fused.covariance)[0] > -1e-12
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_error_of_a_pose_that_stays_is_the_one_that_it_is_said_to_have(known):
+    """Held exactly, parameters have the covariance of the points' noise alone: the inverse of their own Hessian."""
+    points, state, rng = bound(60), truth(0), np.random.default_rng(0)
+    lasting = None if known else np.diag([5e-3, 4e-3, 3e-3, 1e-3, 2e-3, 3e-3])
+    stays = replace(held(state, ESTIMATOR), lasting=lasting)
+    pixels = CAMERA.project(points.in_camera(state)) + 0.05 * rng.standard_normal((60, 2))
+    seen = measured(points, pixels)
+    alone = ESTIMATOR.fit(seen, state, stays)
+    found = SequenceFilter(ESTIMATOR, []).fuse(seen, alone, stays)
+    if lasting is not None:
+        np.testing.assert_allclose(found.pose_std, np.diag(lasting), rtol=0.1)
+        return
+    jacobian = ESTIMATOR.linear(seen, alone).weighted_jacobian[:, :, :3].reshape(-1, 3)
+    variance = np.sum(alone.residuals**2) / (120 - 3)
+    expected = np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    np.testing.assert_allclose(found.parameter_std, expected, rtol=0.1)
 
 
 def test_walking_parameter_is_smoothed_as_much_as_its_step_says():

@@ -435,7 +435,7 @@ class SequenceFilter(Generic[Frame]):
         if known is not None:
             information, by_factor = known.terms(state)[1], known.lasting_push
             hessian += information
-            by_frames += known.squared_px * information - by_factor.T @ by_factor
+            by_frames += known.new_in_frame(information)
         # What a frame does not tell is no better known by many: one more cause that stays the same.
         by_factor = np.vstack([self._unobservable @ hessian[self._constant], by_factor])
         if past is not None and self._past is not None:

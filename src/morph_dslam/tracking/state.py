@@ -98,7 +98,8 @@ class Prior:
         applies to ``pose``; None if nothing is known.
     lasting : (6, k), the part of that increment's error that is the same in all frames, by its k error
         factors in their standard deviations; None if all of it is new in every frame.
-    squared_px : variance of an image coordinate by which covariances were turned into information.
+    squared_px : variance of an image coordinate by which covariances were turned into information; 0 for a pose that
+        is only held: none of its error is new in a frame.
     """
 
     mean: Array
@@ -129,6 +130,15 @@ class Prior:
         if self.lasting is None or self.pose_information is None:
             return np.zeros((0, d + 6))
         return np.hstack([np.zeros((self.lasting.shape[1], d)), self.lasting.T @ self.pose_information])
+
+    def new_in_frame(self, information: Array) -> Array:
+        """Covariance (d + 6, d + 6) of the gradient by errors that are new in every frame.
+
+        ``information`` (d + 6, d + 6) is that of all it knows; what lasts is not among them.
+        """
+        if not self.squared_px:
+            return np.zeros_like(information)
+        return self.squared_px * information - self.lasting_push.T @ self.lasting_push
 
     def joined(self, other: Prior) -> Prior:
         """Both together; ``other`` says what is known of the pose."""

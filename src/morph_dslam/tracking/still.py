@@ -76,11 +76,14 @@ class StillFit:
 
 
 def held(state: State, estimator: Estimator) -> Prior:
-    """The pose of ``state`` as a term of a frame's cost by which the frame cannot move it."""
+    """The pose of ``state`` as a term of a frame's cost by which the frame cannot move it.
+
+    It is no measurement, and has no variance of its own: how far the pose is off counts with the reference view.
+    """
     d, size = len(state.parameters), estimator.scale[-1]
     px_per_metre = estimator.camera.fx / max(float(state.camera_from_object.translation[2]), 1e-6)
     information = HELD * px_per_metre**2 * np.diag([size**2] * 3 + [1.0] * 3)
-    return Prior(np.zeros(d), np.zeros((d, d)), state.camera_from_object, information)
+    return Prior(np.zeros(d), np.zeros((d, d)), state.camera_from_object, information, squared_px=0.0)
 
 
 class StillProblem:
