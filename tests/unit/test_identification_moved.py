@@ -48,7 +48,7 @@ def misfit(table: MeasuredPoints) -> Misfit:
     values = Values(table.model, table.model.parameters[1:2], np.array([TRUTH]))
     raw = table.predict(values)
     predicted = table.adjusted(raw)
-    return Misfit(table, predicted, predicted - raw, np.zeros((len(raw), 0)), 0.0, np.zeros(1), values)
+    return Misfit(table, predicted, predicted - raw, np.zeros((len(raw), 0)), 0.0, 0.0, np.zeros(1), values)
 
 
 @pytest.mark.parametrize("off", [0.0, 0.05])

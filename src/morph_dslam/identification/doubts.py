@@ -49,14 +49,14 @@ def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0, at
 
 
 def notices(
-    forces: MeasuredForces, predicted: Array, slopes: Array, model_rms: float, moduli: float | None
+    forces: MeasuredForces, predicted: Array, slopes: Array, own_rms: float, moduli: float | None
 ) -> tuple[Likeness | None, list[ForceNotice]]:
     """How alike neighbouring residuals are, and what must be known of forces beside predicted ones (n,).
 
     Parameters
     ----------
     slopes : (n, f) derivatives by what was identified.
-    model_rms : root mean square of the model's own errors of the predictions.
+    own_rms : root mean square of the predictions' own errors, by the model and by the states of a run.
     moduli : the common factor of all moduli by which predictions grow; None where it was not identified.
     """
     factor = size_factor(forces, predicted)
@@ -69,24 +69,9 @@ def notices(
         forces.values,
         predicted,
         np.hstack([slopes, scaled, np.ones((len(slopes), int(forces.free_zero)))]),
-        own_rms=float(np.hypot(model_rms, _rms_by_run(forces))),
+        own_rms=own_rms,
         explained=OtherFrameNumbers.of(forces.name, forces.places, predicted, forces.places, forces.values)
         if forces.curve.against == "frame"
         else None,
         picture="identification.png",
     )
-
-
-def _rms_by_run(forces: MeasuredForces) -> float:
-    """What the errors of a run's estimates do to its forces by frame, N; 0 without any."""
-    run = forces.run
-    if run is None or run.covariances is None or forces.curve.against != "frame":
-        return 0.0
-    names, of_run = ([p.name for p in model.parameters] for model in (forces.model, run.model))
-    shared = [name for name in names if name in of_run]
-    to, at = (np.array([own.index(name) for name in shared]) for own in (names, of_run))
-    rows = [row for place in forces.places if (row := run.row(int(place))) is not None]
-    covariances = np.zeros((len(rows), len(names), len(names)))
-    covariances[:, to[:, None], to] = run.covariances[rows][:, at[:, None], at]
-    states = [forces.model.vector(dict(zip(shared, run.parameters[row, at].tolist(), strict=True))) for row in rows]
-    return forces.compared.rms_by_estimates(np.array(states), covariances)

@@ -19,6 +19,7 @@ from scipy.stats import norm, qmc
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.likeness import root_mean_square
+from morph_dslam.identification.common_errors import stacked
 from morph_dslam.identification.doubts import check_size
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measurements import Measurement, Unknowns
@@ -57,7 +58,7 @@ class Estimate:
     parameter : with its range; the factor of all moduli has one too.
     value : that fits best.
     std : standard deviation.
-    model_std : the part of it by the model's own errors.
+    model_std, run_std : the parts of it by the model's own errors, and by those of the states that a run found.
     interval : (2,), 95 %, cut off at the ends of the range; at a bound it does not hold.
     at_bound : whether it is at an end of its range.
     wide : whether the interval is as wide as the range.
@@ -67,6 +68,7 @@ class Estimate:
     value: float
     std: float
     model_std: float
+    run_std: float
     interval: tuple[float, float]
     at_bound: bool
     wide: bool
@@ -87,7 +89,7 @@ class Misfit:
     predicted : (n,) adjusted, as with the zero of the load cell.
     adjustment : (n,) what that added.
     slopes : (n, f) derivatives by the unknowns that are not at an end of their range.
-    model_rms : root mean square of the model's own errors of the predictions.
+    model_rms, run_rms : root mean square of the predictions' errors by the model, and by the states that a run found.
     by_range : (k,) root mean square of what each unknown changes the predictions by over its whole range.
     at : the values with which they were predicted.
     """
@@ -97,6 +99,7 @@ class Misfit:
     adjustment: Array
     slopes: Array
     model_rms: float
+    run_rms: float
     by_range: Array
     at: Unknowns
 
@@ -109,6 +112,11 @@ class Misfit:
     def rms(self) -> float:
         """Root mean square of what it is missed by."""
         return root_mean_square(self.missed)
+
+    @property
+    def own_rms(self) -> float:
+        """Root mean square of the predictions' own errors."""
+        return float(np.hypot(self.model_rms, self.run_rms))
 
     @property
     def offset(self) -> float:
@@ -150,7 +158,8 @@ class Identification:
 
 @dataclass(frozen=True)
 class _Spread:
-    """Covariances (k, k) of estimates over their ranges: by what scatters, what was known before, and the model.
+    """Covariances (k, k) of estimates over their ranges: by what scatters, what was known before, the model, and the
+    states of a run.
 
     ``groups`` is the number of those whose errors count as independent.
     """
@@ -158,16 +167,17 @@ class _Spread:
     scatter: Scatter
     known: Array
     model: Array
+    run: Array
     groups: int
 
     @property
     def covariance(self) -> Array:
-        return self.scatter.covariance + self.known + self.model
+        return self.scatter.covariance + self.known + self.model + self.run
 
     @property
     def half(self) -> Array:
         """Half the width (k,) of 95 % intervals."""
-        return np.sqrt(self.scatter.half**2 + float(norm.ppf(0.975)) ** 2 * np.diag(self.known + self.model))
+        return np.sqrt(self.scatter.half**2 + float(norm.ppf(0.975)) ** 2 * np.diag(self.known + self.model + self.run))
 
 
 def identify(
@@ -358,21 +368,21 @@ class _Fit:
         at_bound = (theta < AT_THE_END) | (theta > 1.0 - AT_THE_END)
         self._check_inside(theta)
         theta = np.where(at_bound, np.round(theta), theta)
-        jacobian, errors = self._jacobian(theta), self._model_errors(theta)
+        jacobian, by_model, by_run = self._jacobian(theta), self._model_errors(theta), self._state_errors(theta)
         silent = [p.name for p, column in zip(self._unknowns, jacobian.T, strict=True) if not column.any()]
         if silent:
             raise IdentificationError(
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
             )
         residuals = self._residuals(theta)
-        spread = self._spread(theta, jacobian, residuals, errors)
+        spread = self._spread(theta, jacobian, residuals, by_model, by_run)
         alike = self._alike(theta, jacobian, float(residuals @ residuals), spread)
         estimates = self._estimates(theta, spread, at_bound, alike)
         std = np.sqrt(np.diag(spread.covariance))
         products = np.outer(std, std)
         # What is fitted without any error has no deviation.
         correlation = np.divide(spread.covariance, products, out=np.eye(len(std)), where=products > 0.0)
-        misfits = self._misfits(theta, jacobian[:, ~at_bound], errors)
+        misfits = self._misfits(theta, jacobian[:, ~at_bound], by_model, by_run)
         return Identification(estimates, correlation, misfits, spread.groups)
 
     def _check_inside(self, theta: Array) -> None:
@@ -409,7 +419,7 @@ class _Fit:
         self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_], alike: Array
     ) -> tuple[Estimate, ...]:
         """Those with values that fit ``alike`` (k, 2) have wider intervals."""
-        std, model = np.sqrt(np.diag(spread.covariance)), np.diag(spread.model)
+        std, model, run = (np.sqrt(np.diag(part)) for part in (spread.covariance, spread.model, spread.run))
         below, above = np.maximum(spread.half[:, None], alike).T
         low, high, value = self._si(theta - below), self._si(theta + above), self._si(theta)
         std = np.sqrt(std**2 + flat_variance(alike.max(axis=1)))
@@ -420,7 +430,8 @@ class _Fit:
                 parameter,
                 float(value[i]),
                 float(slope[i] * std[i]),
-                float(slope[i] * np.sqrt(model[i])),
+                float(slope[i] * model[i]),
+                float(slope[i] * run[i]),
                 (max(float(low[i]), parameter.lower), min(float(high[i]), parameter.upper)),
                 bool(at_bound[i]),
                 bool(std[i] >= UNOBSERVABLE_SHARE),
@@ -428,25 +439,19 @@ class _Fit:
             for i, parameter in enumerate(self._unknowns)
         )
 
-    def _misfits(self, theta: Array, slopes: Array, errors: Array) -> tuple[Misfit, ...]:
-        """With ``slopes`` (n, f) of the residuals and ``errors`` (e, n) of the model, in their units."""
+    def _misfits(self, theta: Array, slopes: Array, by_model: Array, by_run: Array) -> tuple[Misfit, ...]:
+        """With ``slopes`` (n, f) of the residuals and errors (e, n) by the model and by a run, in their units."""
         found, begin, by_range = [], 0, self._by_range(theta)
         for at, (measurement, noise, (raw, predicted)) in enumerate(
             zip(self._measurements, self._noise, self._predictions(theta), strict=True)
         ):
             rows = slice(begin, begin + len(raw))
-            size = root_mean_square(np.linalg.norm(errors[:, rows], axis=0))
-            of_model = noise * size
+            of_model, of_run = (
+                noise * root_mean_square(np.linalg.norm(part[:, rows], axis=0)) for part in (by_model, by_run)
+            )
+            slope, at_value = noise * slopes[rows], self._values(theta)
             found.append(
-                Misfit(
-                    measurement,
-                    predicted,
-                    predicted - raw,
-                    noise * slopes[rows],
-                    of_model,
-                    by_range[:, at],
-                    self._values(theta),
-                )
+                Misfit(measurement, predicted, predicted - raw, slope, of_model, of_run, by_range[:, at], at_value)
             )
             begin = rows.stop
         return tuple(found)
@@ -464,12 +469,13 @@ class _Fit:
         """(e, n) of all measurements, in the units of their residuals; those of one unit have rows in common."""
         values, tables = self._values(theta), self._measurements
         own = [table.model_errors(values) / noise for table, noise in zip(tables, self._noise, strict=True)]
-        blocks = [np.zeros((0, sum(part.shape[1] for part in own)))]
-        for unit in dict.fromkeys(table.unit for table in tables):
-            parts = [part if table.unit == unit else part[:0] for part, table in zip(own, tables, strict=True)]
-            height = max(map(len, parts))
-            blocks.append(np.hstack([np.pad(part, ((0, height - len(part)), (0, 0))) for part in parts]))
-        return np.vstack(blocks)
+        return stacked(own, [table.unit for table in tables])
+
+    def _state_errors(self, theta: Array) -> Array:
+        """(e, n) of all measurements, in the units of their residuals; those of one run have rows in common."""
+        values, tables = self._values(theta), self._measurements
+        own = [table.state_errors(values) / noise for table, noise in zip(tables, self._noise, strict=True)]
+        return stacked(own, [id(table.run) for table in tables])
 
     def _jacobian(self, theta: Array) -> Array:
         """Derivatives (n, k) by central differences within the range."""
@@ -481,14 +487,14 @@ class _Fit:
             columns.append(change / (above - below)[i])
         return np.column_stack(columns)
 
-    def _spread(self, theta: Array, jacobian: Array, residuals: Array, errors: Array) -> _Spread:
-        """Of estimates over their ranges, by the ``errors`` (e, n) of the model among others."""
+    def _spread(self, theta: Array, jacobian: Array, residuals: Array, by_model: Array, by_run: Array) -> _Spread:
+        """Of estimates over their ranges, with errors (e, n) by the model and by a run."""
         design = self._design(jacobian, theta)
         noise, measured = self._shown(design, theta), len(design.slopes)
         scatter = Scatter.of(design, residuals[:measured], (noise.std / self._noise) ** 2, noise)
         # What was known before has the deviation that it came with, even if nothing contradicts it.
         before = design.known * np.maximum(np.abs(residuals[measured:]), 1.0)[:, None] @ design.inverse
-        by_model = errors @ design.free @ design.inverse
+        model, run = (part @ design.free @ design.inverse for part in (by_model, by_run))
         # Directions that the measurements do not see are as uncertain as can be.
         known = before.T @ before + design.unseen @ design.unseen.T
-        return _Spread(scatter, known, by_model.T @ by_model, len(np.unique(self._groups)))
+        return _Spread(scatter, known, model.T @ model, run.T @ run, len(np.unique(self._groups)))

@@ -12,6 +12,7 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import ReactionInDirection
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.identification.common_errors import state_errors
 from morph_dslam.identification.measurements import Unknowns
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.separated import Outside
@@ -189,14 +190,31 @@ class MeasuredForces:
         sizes = np.linalg.norm(forces, axis=1) * np.sign(self.compared.sign * forces[:, self.compared.axis])
         return stated[0] * sizes[None]
 
+    def state_errors(self, unknowns: Unknowns) -> Array:
+        run = self.run
+        if run is None or not self.are_shown:
+            return np.zeros((0, len(self.values)))
+
+        def slopes(mu: Array) -> Array:
+            of_force = self.compared.field.value_and_sensitivities(mu)[1][:, 0, self.compared.axis]
+            return np.asarray(unknowns.factor * self.compared.sign * of_force)
+
+        return state_errors(run, self._run_rows, lambda known: unknowns.vector(known, shown=True), slopes)
+
     @cached_property
     def _known(self) -> list[dict[str, float]]:
         """The parameters of each force that are not identified."""
         if self.curve.against != "frame" or self.run is None:
             return [{self.curve.against: float(place)} for place in self.places]
         names = [parameter.name for parameter in self.run.model.parameters]
+        return [dict(zip(names, self.run.parameters[row].tolist(), strict=True)) for row in self._run_rows]
+
+    @property
+    def _run_rows(self) -> list[int]:
+        """Of each force by frame, where its frame is in the run."""
+        assert self.run is not None
         row_of = {int(frame): row for row, frame in enumerate(self.run.frames)}
-        return [dict(zip(names, self.run.parameters[row_of[int(p)]].tolist(), strict=True)) for p in self.places]
+        return [row_of[int(place)] for place in self.places]
 
     @property
     def loading_rates(self) -> dict[str, float]:

@@ -56,6 +56,7 @@ class MeasuredPoints:
     aligned: bool = False
     name = "points"
     unit = "mm"
+    run = None
     scale = 1e3
 
     def __post_init__(self) -> None:
@@ -140,6 +141,10 @@ class MeasuredPoints:
 
     def model_errors(self, unknowns: Unknowns) -> Array:
         return shape_errors(self.model, self.positions, unknowns.vector)[:, self._present]
+
+    def state_errors(self, unknowns: Unknowns) -> Array:
+        """None: states are as the table gives them."""
+        return np.zeros((0, len(self.values)))
 
     @property
     def given_values(self) -> Array:

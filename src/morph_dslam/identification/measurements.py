@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -93,5 +94,17 @@ class Measurement(Protocol):
         """Errors (e, n) of predictions by the model itself, SI, independent of each other, of either sign.
 
         Measurements of one unit share them.
+        """
+        ...
+
+    @property
+    def run(self) -> Run | None:
+        """The run that found the states in which it was measured, if one did."""
+        ...
+
+    def state_errors(self, unknowns: Unknowns) -> Array:
+        """Errors (e, n) of predictions by those of the states that a run found, SI, independent of each other.
+
+        Measurements of one run share them.
         """
         ...

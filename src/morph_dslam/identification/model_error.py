@@ -41,7 +41,7 @@ def shape_errors(model: ReducedModel, positions: Callable[[Vector], Array], vect
             mu = np.clip(vector(known), model.lower + STEP * ranges, model.upper - STEP * ranges)
             key = mu.tobytes()
             if key not in changes:
-                changes[key] = _root(errors.at(mu, followed=False).parameters / np.outer(ranges, ranges))
+                changes[key] = symmetric_root(errors.at(mu, followed=False).parameters / np.outer(ranges, ranges))
             return mu + share * ranges * changes[key][:, k]
 
         return made
@@ -52,7 +52,7 @@ def shape_errors(model: ReducedModel, positions: Callable[[Vector], Array], vect
     return np.array(differences) / (2.0 * share)
 
 
-def _root(covariance: Array) -> Array:
-    """The symmetric root (d, d): in neighbouring states its columns are alike."""
+def symmetric_root(covariance: Array) -> Array:
+    """Of a covariance (d, d), the symmetric root (d, d): in neighbouring states its columns are alike."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=np.float64)

@@ -64,6 +64,7 @@ def _figures(each: Estimate) -> dict[str, Any]:
         "value": parameter.display(each.value),
         "standard_deviation": parameter.display(each.std),
         "standard_deviation_by_model": parameter.display(each.model_std),
+        "standard_deviation_by_run": parameter.display(each.run_std),
         "interval_95": [parameter.display(end) for end in each.interval],
         "at_bound": each.at_bound,
         "as_wide_as_range": each.wide,
@@ -84,6 +85,7 @@ def _misfit_figures(misfit: Misfit, found: Identification) -> dict[str, Any]:
         "largest": scale * float(np.abs(misfit.missed).max()),
         "change_rms": scale * root_mean_square(measurement.changes),
         "model_error_rms": scale * misfit.model_rms,
+        "run_error_rms": scale * misfit.run_rms,
         "change_over_range_rms": dict(zip(identified, (scale * misfit.by_range).tolist(), strict=True)),
         "mesh_error_stated": measurement.mesh_error_stated,
         "at_default": [
@@ -114,7 +116,7 @@ def _force_figures(
     """Those that points do not have."""
     units = {p.name: p for p in forces.model.parameters}
     rates = [(n, rate) for n, rate in forces.loading_rates.items() if n not in identified]
-    alike, found = notices(forces, misfit.predicted, misfit.slopes, misfit.model_rms, moduli)
+    alike, found = notices(forces, misfit.predicted, misfit.slopes, misfit.own_rms, moduli)
     figures = {
         "support": forces.compared.support,
         "direction": forces.compared.direction,
@@ -227,7 +229,7 @@ def _weak(each: Mapping[str, Any], measurements: Sequence[Mapping[str, Any]]) ->
 
 
 def _model_errors(figures: Mapping[str, Any]) -> list[str]:
-    """Which intervals are the model's own error, and where its file does not state all of it."""
+    """Which intervals are errors of the model or of a run, and where the model's file does not state all of its."""
     said, half = [], np.sqrt(0.5)
     if by_model := [
         each["name"]
@@ -237,6 +239,15 @@ def _model_errors(figures: Mapping[str, Any]) -> list[str]:
         said.append(
             f"note: most of the interval of {', '.join(by_model)} is the model's own error: finer elements, or more "
             "training solutions, would narrow it"
+        )
+    if by_run := [
+        each["name"]
+        for each in figures["parameters"]
+        if each["standard_deviation_by_run"] > half * each["standard_deviation"]
+    ]:
+        said.append(
+            f"note: most of the interval of {', '.join(by_run)} is by errors of the run's states, which all its frames "
+            "have in common: a better known reference frame (more landmarks, --at-rest) would narrow it"
         )
     if unknown := [each["name"] for each in figures["measurements"] if not each["mesh_error_stated"]]:
         said.append(
