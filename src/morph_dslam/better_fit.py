@@ -5,7 +5,7 @@ from __future__ import annotations
 from scipy.special import fdtrc
 
 
-def chance_of_better_fit(before: float, after: float, n_freed: int, freedom: int, least_std: float) -> float:
+def chance_of_better_fit(before: float, after: float, n_freed: int, freedom: float, least_std: float) -> float:
     """The chance with which errors alone make the residuals of further unknowns so much smaller (F test).
 
     Parameters

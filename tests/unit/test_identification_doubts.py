@@ -15,7 +15,8 @@ from morph_dslam.evaluation.force import reaction_in_direction
 from morph_dslam.evaluation.force_curves import ForceCurve, load_curve
 from morph_dslam.evaluation.likeness import likeness
 from morph_dslam.evaluation.run_folder import Run
-from morph_dslam.identification.identify import Identification, identify
+from morph_dslam.identification.found import Identification
+from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.report import identification_lines, summarise

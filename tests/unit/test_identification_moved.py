@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morph_dslam.identification.identify import Identification, Misfit, identify
+from morph_dslam.identification.found import Identification, Misfit
+from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.moved_states import moved_states
 from morph_dslam.identification.report import identification_lines, summarise

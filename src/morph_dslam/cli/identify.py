@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,7 +68,10 @@ def run(arguments: argparse.Namespace) -> None:
     folder: Path | None = arguments.run_folder
     tracked = None if folder is None else load_run(folder)
     _check_once([(path.resolve(),) for path in arguments.points])
-    points = [load_points(path, model, arguments.align_points) for path in arguments.points]
+    points = [
+        replace(load_points(path, model, arguments.align_points), name=name)
+        for path, name in zip(arguments.points, _distinct([(p, "points") for p in arguments.points]), strict=True)
+    ]
     forces = _forces(arguments, model, tracked)
     prior, notes = KnownValues.none(), list[str]()
     if folder is not None and tracked is not None:
@@ -93,9 +97,22 @@ def _forces(arguments: argparse.Namespace, model: ReducedModel, tracked: Run | N
     curves = [load_curve(path, model, column, FEWEST_FORCES) for path, column in arguments.force]
     files = [path.resolve() for path, _ in arguments.force]
     _check_once([(path, curve.name) for path, curve in zip(files, curves, strict=True)])
+    names = _distinct([(path, curve.name) for (path, _), curve in zip(arguments.force, curves, strict=True)])
     return [
-        MeasuredForces(model, curve, reaction_in_direction(model, text), tracked, not arguments.no_offset)
-        for curve, text in zip(curves, arguments.reaction, strict=True)
+        MeasuredForces(
+            model, replace(curve, name=name), reaction_in_direction(model, text), tracked, not arguments.no_offset
+        )
+        for curve, name, text in zip(curves, names, arguments.reaction, strict=True)
+    ]
+
+
+def _distinct(tables: Sequence[tuple[Path, str]]) -> list[str]:
+    """Names of tables, of their files and own names: with the file where several have the same name."""
+    names = [name for _, name in tables]
+    files = [path.name for path, _ in tables]
+    return [
+        name if names.count(name) == 1 else f"{path.name if files.count(path.name) == 1 else path}:{name}"
+        for path, name in tables
     ]
 
 

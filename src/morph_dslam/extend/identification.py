@@ -1,11 +1,7 @@
 """Identification of constant parameters from measured points and forces."""
 
-from morph_dslam.identification.identify import (
-    Estimate as Estimate,
-    Identification as Identification,
-    Misfit as Misfit,
-    identify as identify,
-)
+from morph_dslam.identification.found import Estimate as Estimate, Identification as Identification, Misfit as Misfit
+from morph_dslam.identification.identify import identify as identify
 from morph_dslam.identification.measured_forces import FEWEST_FORCES as FEWEST_FORCES, MeasuredForces as MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints as MeasuredPoints, load_points as load_points
 from morph_dslam.identification.measurements import Measurement as Measurement

@@ -2,10 +2,10 @@
 
 A run knows the state of each frame with a covariance. Most of such errors come from what all frames share, the
 reference view and the landmarks in it. They count as one error of the whole sequence: the state of frame f is off by
-C_f^1/2 z, with one z of all frames, and C_f^1/2 symmetric, so that neighbouring frames have nearly the same error. That
-is the coupling of the frames' errors that differ least from frame to frame (Dowson and Landau, 1982,
-https://doi.org/10.1016/0047-259X(82)90077-X). What is independent from frame to frame shows in the residuals of the
-measurement, and counts with its scatter.
+C_f^1/2 z, with one z of all frames, and C_f^1/2 symmetric, so that neighbouring frames have nearly the same error.
+Where their covariances commute, no other errors with these covariances differ less from frame to frame (Dowson and
+Landau, 1982, https://doi.org/10.1016/0047-259X(82)90077-X). What is independent from frame to frame shows in the
+residuals of the measurement, and counts with its scatter.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
 """Identification: the parameters for which a reduced model predicts what was measured best.
 
 Weighted least squares over all measurements, each in units of its noise. Standard deviations allow for errors that
-belong together, as those of one state, and for what tables do not know of themselves (`scatter`). To that come what was
-known before, with its own deviation, and the model's errors e, by (J'J)^-1 J'e. Intervals are Student's for what
-scatters, and normal for the rest.
+belong together, as those of one state, and for what tables do not know of themselves (`scatter`); curves that differ as
+a whole are weighted and count as such (`curve_factors`). To that come what was known before, with its own deviation,
+and errors e of the model and of a run's states, by (J'J)^-1 J'e. Intervals are Student's for what scatters, and normal
+for the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -20,11 +21,13 @@ from scipy.stats import norm, qmc
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.common_errors import stacked
+from morph_dslam.identification.curve_factors import CurveFactors, curve_factors, noise_within
 from morph_dslam.identification.doubts import check_size
+from morph_dslam.identification.found import Estimate, Identification, Misfit
 from morph_dslam.identification.measured_forces import MeasuredForces
-from morph_dslam.identification.measurements import Measurement, Unknowns
+from morph_dslam.identification.measurements import Measurement
 from morph_dslam.identification.prior import KnownValues
-from morph_dslam.identification.scatter import Design, Noise, Scatter, directions
+from morph_dslam.identification.scatter import Design, Noise, Scatter, directions, joint_labels, wider, without
 from morph_dslam.identification.values import FACTOR, Values
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.tracking.flat_sides import LOOK, flat_variance
@@ -47,113 +50,6 @@ AT_THE_END = 1e-6
 PLACES = 49
 #: Logarithms of factors are cut here.
 LARGEST = 700.0
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One identified parameter, SI.
-
-    Attributes
-    ----------
-    parameter : with its range; the factor of all moduli has one too.
-    value : that fits best.
-    std : standard deviation.
-    model_std, run_std : the parts of it by the model's own errors, and by those of the states that a run found.
-    interval : (2,), 95 %, cut off at the ends of the range; at a bound it does not hold.
-    at_bound : whether it is at an end of its range.
-    wide : whether the interval is as wide as the range.
-    """
-
-    parameter: Parameter
-    value: float
-    std: float
-    model_std: float
-    run_std: float
-    interval: tuple[float, float]
-    at_bound: bool
-    wide: bool
-
-    @property
-    def identified(self) -> bool:
-        """Whether the interval is narrower than the range, and the value inside of it."""
-        return not (self.wide or self.at_bound)
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """What a measurement is missed by, SI.
-
-    Attributes
-    ----------
-    measurement : see `measurements`.
-    predicted : (n,) adjusted, as with the zero of the load cell.
-    adjustment : (n,) what that added.
-    slopes : (n, f) derivatives by the unknowns that are not at an end of their range.
-    model_rms, run_rms : root mean square of the predictions' errors by the model, and by the states that a run found.
-    by_range : (k,) root mean square of what each unknown changes the predictions by over its whole range.
-    at : the values with which they were predicted.
-    """
-
-    measurement: Measurement
-    predicted: Array
-    adjustment: Array
-    slopes: Array
-    model_rms: float
-    run_rms: float
-    by_range: Array
-    at: Unknowns
-
-    @property
-    def missed(self) -> Array:
-        """Predicted minus measured (n,)."""
-        return self.predicted - self.measurement.values
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of what it is missed by."""
-        return root_mean_square(self.missed)
-
-    @property
-    def own_rms(self) -> float:
-        """Root mean square of the predictions' own errors."""
-        return float(np.hypot(self.model_rms, self.run_rms))
-
-    @property
-    def offset(self) -> float:
-        """The zero of a load cell that fits best; 0 where there is none."""
-        return float(self.adjustment.mean())
-
-
-@dataclass(frozen=True)
-class Identification:
-    """What was identified.
-
-    Attributes
-    ----------
-    estimates : one for each parameter.
-    correlation : (k, k) of the estimates.
-    misfits : of each measurement.
-    groups : number of groups of values whose errors count as independent.
-    loads : of given size, beside a factor of all moduli; None where that was not identified.
-    """
-
-    estimates: tuple[Estimate, ...]
-    correlation: Array
-    misfits: tuple[Misfit, ...]
-    groups: int
-    loads: GivenLoads | None = None
-
-    def __getitem__(self, name: str) -> Estimate:
-        return next(each for each in self.estimates if each.parameter.name == name)
-
-    def size_factor(self, forces: MeasuredForces) -> float | None:
-        """The common factor of all moduli as one of the size of forces; None where it was not identified.
-
-        It is 1 where it divides loads too: a force that balances a load is as large as that, whatever the moduli are.
-        """
-        if self.loads is None:
-            return None
-        return 1.0 if self.loads.scaled and not forces.are_shown else self[FACTOR].value
 
 
 @dataclass(frozen=True)
@@ -278,16 +174,14 @@ class _Fit:
         ends = np.array([(p.lower, p.upper) for p in unknowns])
         self._ends = np.where(self._log[:, None], np.log(np.maximum(ends, 1e-300)), ends)
         self._noise = np.ones(len(self._measurements))
-        self._groups = self._joint_groups()
+        self._factors = CurveFactors(0.0, [np.zeros(len(each.values)) for each in self._measurements])
+        self._groups = joint_labels([each.groups for each in self._measurements])
 
-    def _joint_groups(self) -> NDArray[np.int64]:
-        """Labels (n,) over all measurements."""
-        parts: list[NDArray[np.int64]] = []
-        for measurement in self._measurements:
-            start = parts[-1].max() + 1 if parts else 0
-            parts.append(np.unique(measurement.groups, return_inverse=True)[1] + start)
-        start = parts[-1].max() + 1 if parts else 0
-        return np.concatenate([*parts, start + np.arange(len(self._is_known))])
+    @property
+    def _curves(self) -> NDArray[np.int64]:
+        """Labels (n,) that give each curve one group."""
+        labels = [np.zeros_like(m.groups) if isinstance(m, MeasuredForces) else m.groups for m in self._measurements]
+        return joint_labels(labels)
 
     def _si(self, theta: Array) -> Array:
         inner = self._ends[:, 0] + theta * np.diff(self._ends, axis=1)[:, 0]
@@ -310,9 +204,20 @@ class _Fit:
 
     def _residuals(self, theta: Array) -> Array:
         """What was known before comes last."""
-        parts = [missed / noise for missed, noise in zip(self._missed(theta), self._noise, strict=True)]
-        away = self._values(theta).shown(self._prior.names) - self._prior.values
-        return np.concatenate([*parts, self._whitening @ away])
+        return np.concatenate([self._whitened(np.concatenate([*self._missed(theta), []])), self._away(theta)])
+
+    def _away(self, theta: Array) -> Array:
+        """From what was known before, in units of its deviation (p,)."""
+        return self._whitening @ (self._values(theta).shown(self._prior.names) - self._prior.values)
+
+    def _whitened(self, values: Array) -> Array:
+        """Values (n, ...) of all measurements, SI, with independent errors of size 1."""
+        begin, parts = 0, [values[:0]]
+        for at, (measurement, noise) in enumerate(zip(self._measurements, self._noise, strict=True)):
+            rows = slice(begin, begin + len(measurement.values))
+            parts.append(self._factors.whitened(at, values[rows], float(noise)))
+            begin = rows.stop
+        return np.concatenate(parts)
 
     def best(self) -> Array:
         """The unknowns that fit best, over their ranges; measurements are weighted by the noise that they show."""
@@ -325,15 +230,46 @@ class _Fit:
         most = (1.0 + ALIKE) * min(cost for cost, _ in ends)
         found = next(end for cost, end in ends if cost <= most)
         for _ in range(ROUNDS):
-            before, design = self._noise, self._design(self._jacobian(found), found)
-            self._noise = np.maximum(self._shown(design, found).std, self._least())
+            before = np.append(self._noise, self._factors.std)
+            self._weigh(found)
             found = self._solved(found)[1]
             # One table alone has the same weight whatever its noise is.
-            if len(self._measurements) + len(self._is_known) < 2 or np.all(
-                np.abs(self._noise - before) <= SETTLED * before
-            ):
+            changes = np.abs(np.append(self._noise, self._factors.std) - before)
+            if len(self._measurements) + len(self._is_known) < 2 or np.all(changes <= SETTLED * before):
                 break
         return found
+
+    def _weigh(self, theta: Array) -> None:
+        """Weight measurements by what they show: their noise, and how far whole curves differ."""
+        missed, ways, least = self._missed(theta), self._ways(theta), self._least()
+        self._factors = CurveFactors(0.0, ways)
+        if sum(way.any() for way in ways) > 1:
+            before, within = self._noise, self._shown(theta, by_curve=True)
+            self._noise = np.maximum(within.std, least)
+            errors = self._whitened(self._state_errors(theta).T).T
+            self._factors = curve_factors(
+                self._design(theta), missed, ways, self._stated(theta, ways), errors, replace(within, std=self._noise)
+            )
+            if self._factors.std > 0.0:
+                return
+            self._noise = before
+        self._noise = np.maximum(self._shown(theta).std, least)
+
+    def _stated(self, theta: Array, ways: Sequence[Array]) -> float:
+        """Relative standard deviation of the model's forces; it may differ from curve to curve."""
+        values, tables = self._values(theta), zip(self._measurements, ways, strict=True)
+        sizes = [(float(np.linalg.norm(each.model_errors(values))), float(np.linalg.norm(way))) for each, way in tables]
+        return max((error / size for error, size in sizes if size > 0.0), default=0.0)
+
+    def _ways(self, theta: Array) -> list[Array]:
+        """Of each measurement (n_j,), what a factor of a whole force curve changes; zeros of points."""
+        pairs = zip(self._measurements, self._predictions(theta), strict=True)
+        return [
+            without(raw[:, None], directions(each.loose(raw)))[:, 0]
+            if isinstance(each, MeasuredForces)
+            else np.zeros(len(raw))
+            for each, (raw, _) in pairs
+        ]
 
     def _changes(self) -> Array:
         """By how much the load changed the values of each measurement, (m,); those of one unit are alike."""
@@ -347,16 +283,18 @@ class _Fit:
         """Noise (m,) of values that are predicted to rounding: they must not get all the weight."""
         return np.array([1e-6 * max(float(np.abs(m.values).max()), 1e-300) for m in self._measurements])
 
-    def _shown(self, design: Design, theta: Array) -> Noise:
-        units = [each.unit for each in self._measurements]
-        return Noise.shown(design, self._missed(theta), units, self._changes())
+    def _shown(self, theta: Array, by_curve: bool = False) -> Noise:
+        """The noise that residuals show; ``by_curve`` within curves that have a factor each."""
+        units, missed, design = [each.unit for each in self._measurements], self._missed(theta), self._design(theta)
+        if by_curve:
+            return noise_within(design, missed, self._ways(theta), units, self._changes(), self._noise)
+        return Noise.shown(design, missed, units, self._changes())
 
-    def _design(self, jacobian: Array, theta: Array) -> Design:
-        """With the derivatives (n, k) of all residuals."""
+    def _design(self, theta: Array) -> Design:
         pairs = zip(self._predictions(theta), self._measurements, strict=True)
         loose = [directions(each.loose(predicted)) for (_, predicted), each in pairs]
-        measured = len(jacobian) - len(self._is_known)
-        return Design(jacobian[:measured], jacobian[measured:], loose, self._groups[:measured])
+        slopes = self._whitened(self._slopes(theta))
+        return Design(slopes, self._differences(self._away, theta), loose, self._groups)
 
     def _solved(self, start: Array) -> tuple[float, Array]:
         inside = np.clip(start, 1e-9, 1.0 - 1e-9)
@@ -375,15 +313,15 @@ class _Fit:
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
             )
         residuals = self._residuals(theta)
-        spread = self._spread(theta, jacobian, residuals, by_model, by_run)
+        spread = self._spread(theta, residuals, by_model, by_run)
         alike = self._alike(theta, jacobian, float(residuals @ residuals), spread)
         estimates = self._estimates(theta, spread, at_bound, alike)
         std = np.sqrt(np.diag(spread.covariance))
         products = np.outer(std, std)
         # What is fitted without any error has no deviation.
         correlation = np.divide(spread.covariance, products, out=np.eye(len(std)), where=products > 0.0)
-        misfits = self._misfits(theta, jacobian[:, ~at_bound], by_model, by_run)
-        return Identification(estimates, correlation, misfits, spread.groups)
+        misfits = self._misfits(theta, self._slopes(theta)[:, ~at_bound], by_model, by_run)
+        return Identification(estimates, correlation, misfits, spread.groups, curve_std=self._factors.std)
 
     def _check_inside(self, theta: Array) -> None:
         """Refuse a factor of the moduli with which loads are, for the model, outside of their ranges."""
@@ -440,16 +378,14 @@ class _Fit:
         )
 
     def _misfits(self, theta: Array, slopes: Array, by_model: Array, by_run: Array) -> tuple[Misfit, ...]:
-        """With ``slopes`` (n, f) of the residuals and errors (e, n) by the model and by a run, in their units."""
+        """With ``slopes`` (n, f) of predictions, and errors (e, n) by the model and by a run, SI."""
         found, begin, by_range = [], 0, self._by_range(theta)
-        for at, (measurement, noise, (raw, predicted)) in enumerate(
-            zip(self._measurements, self._noise, self._predictions(theta), strict=True)
+        for at, (measurement, (raw, predicted)) in enumerate(
+            zip(self._measurements, self._predictions(theta), strict=True)
         ):
             rows = slice(begin, begin + len(raw))
-            of_model, of_run = (
-                noise * root_mean_square(np.linalg.norm(part[:, rows], axis=0)) for part in (by_model, by_run)
-            )
-            slope, at_value = noise * slopes[rows], self._values(theta)
+            of_model, of_run = (root_mean_square(np.linalg.norm(part[:, rows], axis=0)) for part in (by_model, by_run))
+            slope, at_value = slopes[rows], self._values(theta)
             found.append(
                 Misfit(measurement, predicted, predicted - raw, slope, of_model, of_run, by_range[:, at], at_value)
             )
@@ -466,35 +402,44 @@ class _Fit:
         return changes
 
     def _model_errors(self, theta: Array) -> Array:
-        """(e, n) of all measurements, in the units of their residuals; those of one unit have rows in common."""
+        """(e, n) of all measurements, SI; those of one unit have rows in common."""
         values, tables = self._values(theta), self._measurements
-        own = [table.model_errors(values) / noise for table, noise in zip(tables, self._noise, strict=True)]
-        return stacked(own, [table.unit for table in tables])
+        return stacked([table.model_errors(values) for table in tables], [table.unit for table in tables])
 
     def _state_errors(self, theta: Array) -> Array:
-        """(e, n) of all measurements, in the units of their residuals; those of one run have rows in common."""
+        """(e, n) of all measurements, SI; those of one run have rows in common."""
         values, tables = self._values(theta), self._measurements
-        own = [table.state_errors(values) / noise for table, noise in zip(tables, self._noise, strict=True)]
-        return stacked(own, [id(table.run) for table in tables])
+        return stacked([table.state_errors(values) for table in tables], [id(table.run) for table in tables])
 
     def _jacobian(self, theta: Array) -> Array:
-        """Derivatives (n, k) by central differences within the range."""
+        """Derivatives (n + p, k) of the residuals."""
+        return self._differences(self._residuals, theta)
+
+    def _slopes(self, theta: Array) -> Array:
+        """Derivatives (n, k) of what is missed, SI."""
+        return self._differences(lambda at: np.concatenate([*self._missed(at), []]), theta)
+
+    def _differences(self, function: Callable[[Array], Array], theta: Array) -> Array:
+        """Derivatives (n, k) of a function (n,) by central differences within the range."""
         columns = []
         for i in range(len(theta)):
             step = 1e-4 * np.eye(len(theta))[i]
             above, below = np.clip(theta + step, 0.0, 1.0), np.clip(theta - step, 0.0, 1.0)
-            change = self._residuals(above) - self._residuals(below)
+            change = function(above) - function(below)
             columns.append(change / (above - below)[i])
         return np.column_stack(columns)
 
-    def _spread(self, theta: Array, jacobian: Array, residuals: Array, by_model: Array, by_run: Array) -> _Spread:
-        """Of estimates over their ranges, with errors (e, n) by the model and by a run."""
-        design = self._design(jacobian, theta)
-        noise, measured = self._shown(design, theta), len(design.slopes)
-        scatter = Scatter.of(design, residuals[:measured], (noise.std / self._noise) ** 2, noise)
+    def _spread(self, theta: Array, residuals: Array, by_model: Array, by_run: Array) -> _Spread:
+        """Of estimates over their ranges, with errors (e, n), SI, by the model and by a run."""
+        design, differ = self._design(theta), self._factors.std > 0.0
+        noise, measured = self._shown(theta, by_curve=differ), len(design.slopes)
+        shown = (residuals[:measured], (noise.std / self._noise) ** 2, noise)
+        scatter, groups = Scatter.of(design, *shown), self._curves if differ else self._groups
+        if differ:
+            scatter = wider(scatter, Scatter.of(replace(design, groups=groups), *shown))
         # What was known before has the deviation that it came with, even if nothing contradicts it.
         before = design.known * np.maximum(np.abs(residuals[measured:]), 1.0)[:, None] @ design.inverse
-        model, run = (part @ design.free @ design.inverse for part in (by_model, by_run))
+        model, run = (self._whitened(part.T).T @ design.free @ design.inverse for part in (by_model, by_run))
         # Directions that the measurements do not see are as uncertain as can be.
         known = before.T @ before + design.unseen @ design.unseen.T
-        return _Spread(scatter, known, model.T @ model, run.T @ run, len(np.unique(self._groups)))
+        return _Spread(scatter, known, model.T @ model, run.T @ run, len(np.unique(groups)) + len(self._is_known))

@@ -46,6 +46,7 @@ class MeasuredPoints:
     places : (r, 3) on the undeformed object, m.
     measured : (r, 3) in the state, m; NaN where a coordinate was not measured.
     aligned : whether one rigid motion of all points is unknown, as where they were measured in another frame.
+    name : for people.
     """
 
     model: ReducedModel
@@ -54,7 +55,7 @@ class MeasuredPoints:
     places: Array
     measured: Array
     aligned: bool = False
-    name = "points"
+    name: str = "points"
     unit = "mm"
     run = None
     scale = 1e3

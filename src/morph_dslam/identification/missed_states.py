@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from morph_dslam.evaluation.likeness import root_mean_square
-from morph_dslam.identification.identify import Misfit
+from morph_dslam.identification.found import Misfit
 from morph_dslam.identification.measured_points import MeasuredPoints
 
 #: A state is missed where more than this part of its own change is left.

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.better_fit import chance_of_better_fit
-from morph_dslam.identification.identify import Misfit
+from morph_dslam.identification.found import Misfit
 from morph_dslam.identification.measured_points import MeasuredPoints
-from morph_dslam.identification.scatter import directions
+from morph_dslam.identification.scatter import scaled_directions
 
 Array = NDArray[np.float64]
 #: Points that moved as one body fit better by other motions, as much as is said of, with this chance at most.
@@ -88,16 +88,9 @@ def _chance(missed: Array, null: Array, more: Array, least: float) -> tuple[floa
 
     With what is missed then, root mean square.
     """
-    before, after = (directions(_alike(columns)) for columns in (null, np.hstack([null, more])))
+    before, after = (scaled_directions(columns) for columns in (null, np.hstack([null, more])))
     q, freedom = after.shape[1] - before.shape[1], len(missed) - after.shape[1]
     left, least_left = (float(np.sum((missed - b @ (b.T @ missed)) ** 2)) for b in (before, after))
     if q < 1 or freedom < 1:
         return 1.0, 0.0
     return chance_of_better_fit(left, least_left, q, freedom, least), float(np.sqrt(least_left / len(missed)))
-
-
-def _alike(columns: Array) -> Array:
-    """Columns (n, q) of unit length; those of rounding are left out, as of what nothing depends on."""
-    lengths = np.linalg.norm(columns, axis=0)
-    kept = lengths > np.finfo(float).tiny
-    return np.asarray(columns[:, kept] / lengths[kept])

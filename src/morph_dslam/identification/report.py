@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import SMALL_SHARE, noticed, reaction_remark
 from morph_dslam.evaluation.likeness import root_mean_square
-from morph_dslam.identification.doubts import notices
-from morph_dslam.identification.identify import Estimate, Identification, Misfit
+from morph_dslam.identification.doubts import notices, size_factor
+from morph_dslam.identification.found import Estimate, Identification, Misfit
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.missed_states import missed_state_notes, state_figures
@@ -42,6 +42,7 @@ def summarise(found: Identification) -> dict[str, Any]:
         "correlation": dict(zip(names, rows, strict=True)),
         "measurements": [_misfit_figures(misfit, found) for misfit in found.misfits],
         "groups": found.groups,
+        "curve_factor_standard_deviation": found.curve_std,
         **({} if found.loads is None else {"loads": _load_figures(found.loads)}),
     }
 
@@ -117,7 +118,9 @@ def _force_figures(
     units = {p.name: p for p in forces.model.parameters}
     rates = [(n, rate) for n, rate in forces.loading_rates.items() if n not in identified]
     alike, found = notices(forces, misfit.predicted, misfit.slopes, misfit.own_rms, moduli)
+    own = size_factor(forces, misfit.predicted)
     figures = {
+        "own_factor": own,
         "support": forces.compared.support,
         "direction": forces.compared.direction,
         "against": forces.curve.against,
@@ -159,6 +162,7 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
             f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
             "intervals are rough"
         )
+    said += _curves_differ(figures)
     said += [*_given_loads(figures.get("loads")), *_model_errors(figures), *_at_default(measured, FACTOR in names)]
     return said + [line for each in measured for line in _measurement_lines(each)]
 
@@ -174,6 +178,20 @@ def _held_by_ends(figures: Mapping[str, Any]) -> list[str]:
                 f"{'its interval does' if len(moved) == 1 else 'their intervals do'} not hold"
             )
     return said
+
+
+def _curves_differ(figures: Mapping[str, Any]) -> list[str]:
+    """That whole force curves disagree, and what the interval is of then."""
+    std = figures["curve_factor_standard_deviation"]
+    if not std > 0.0:
+        return []
+    own = [(m["name"], m["own_factor"]) for m in figures["measurements"] if m.get("own_factor") is not None]
+    listed = ", ".join(f"{name} {100.0 * (factor - 1.0):+.2g} %" for name, factor in own)
+    return [
+        f"note: force curves differ as a whole by {100.0 * std:.2g} % (standard deviation of a factor), more than the "
+        f"scatter of each explains; against the model's forces they are {listed}: specimens, their sections, load "
+        "cells or the law differ. The interval is that of the mean of all such specimens; more curves would narrow it"
+    ]
 
 
 def _given_loads(loads: Mapping[str, Any] | None) -> list[str]:

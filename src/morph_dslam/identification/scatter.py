@@ -39,6 +39,13 @@ def directions(columns: Array) -> Array:
     return np.asarray(left[:, sizes > ROUNDING * max(float(sizes[0]), np.finfo(float).tiny)], dtype=np.float64)
 
 
+def scaled_directions(columns: Array) -> Array:
+    """`directions` of columns (n, q) whose sizes say nothing; those of rounding are left out."""
+    lengths = np.linalg.norm(columns, axis=0)
+    kept = lengths > np.finfo(float).tiny
+    return directions(columns[:, kept] / lengths[kept])
+
+
 @dataclass(frozen=True)
 class Design:
     """The linear least squares that the fit is near its end, in units of the noise.
@@ -66,7 +73,7 @@ class Design:
     def free(self) -> Array:
         """Derivatives (n, k) of what is left when the tables' own unknowns have taken their part."""
         parts = zip(self.tables, self.loose, strict=True)
-        return np.vstack([np.zeros((0, self.slopes.shape[1])), *(_without(self.slopes[rows], q) for rows, q in parts)])
+        return np.vstack([np.zeros((0, self.slopes.shape[1])), *(without(self.slopes[rows], q) for rows, q in parts)])
 
     @cached_property
     def _eigen(self) -> tuple[Array, Array]:
@@ -76,7 +83,9 @@ class Design:
     @property
     def _seen(self) -> NDArray[np.bool_]:
         values = self._eigen[0]
-        return np.asarray(values > 1e-12 * values.max())
+        # Of what the tables' own unknowns take whole, rounding is left.
+        rounding = ROUNDING**2 * float(np.sum(self.slopes**2))
+        return np.asarray(values > max(1e-12 * values.max(), rounding))
 
     @property
     def unseen(self) -> Array:
@@ -116,7 +125,16 @@ class Design:
         return sum(len(self.loose[at]) for at in tables) - taken - int(depends.sum())
 
 
-def _without(values: Array, basis: Array) -> Array:
+def joint_labels(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Labels (n,), from 0, over all tables of those of each."""
+    found = [np.zeros(0, dtype=np.int64)]
+    for labels in parts:
+        start = max((int(each.max()) + 1 for each in found if each.size), default=0)
+        found.append(start + np.unique(labels, return_inverse=True)[1])
+    return np.concatenate(found)
+
+
+def without(values: Array, basis: Array) -> Array:
     """Columns (n, k) without what an orthonormal basis (n, q) spans."""
     return np.asarray(values - basis @ (basis.T @ values))
 
@@ -209,6 +227,13 @@ class Scatter:
         )
         wider = np.sqrt(np.maximum(together / own, 1.0))
         return cls(covariance * np.outer(wider, wider), half)
+
+
+def wider(one: Scatter, other: Scatter) -> Scatter:
+    """Of two, whichever is wider for each estimate."""
+    own, others = np.diag(one.covariance), np.diag(other.covariance)
+    wider = np.sqrt(np.maximum(others / np.maximum(own, np.finfo(float).tiny), 1.0))
+    return Scatter(one.covariance * np.outer(wider, wider), np.maximum(one.half, other.half))
 
 
 def _quantile(freedom: Array) -> Array:
