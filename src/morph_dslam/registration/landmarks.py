@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.camera import Camera
-from morph_dslam.errors import ArgumentError, check_kind
+from morph_dslam.errors import ArgumentError, RegistrationError, check_kind
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel
@@ -31,6 +31,7 @@ from morph_dslam.registration.messages import (
     AtBound,
     DepthAgainstLandmarks,
     DepthBehindObject,
+    DepthScaleUnlikely,
     FewLandmarks,
     NotAtRest,
     PoorFit,
@@ -39,7 +40,7 @@ from morph_dslam.registration.messages import (
     UnusualSize,
 )
 from morph_dslam.registration.other_values import values_of_same_shape
-from morph_dslam.registration.outline_snap import OutlineSnap, distinct_states
+from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rig_check import cameras_contradict
@@ -59,6 +60,12 @@ UNKNOWN_PX = 2.0
 ENOUGH_SPARE = 6
 #: Landmarks fit so much better without depth that is right with this chance at most.
 DEPTH_CHANCE = 1e-4
+#: A scale of the depths that differs by so many of its deviations is named.
+UNLIKELY = 3.0
+#: Landmarks alone may have the object so many standard deviations too near or too far.
+OFF_SIGMAS = 3.0
+#: Two states explain as much of the depth if the shares that belong to the object differ by less.
+SAME_SHARE = 0.02
 #: More of the depths on an object than this share do not lie behind it, if they belong to its pixels.
 SEEN_THROUGH = 0.05
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
@@ -195,14 +202,42 @@ def _by_depth(
     """The object along the sight line by the frame's depth (h, w), with its deviations at 1 m and of its scale."""
     # How well the landmarks fit shows how carefully they were set. A few that happen to fit well are no more exact.
     sigma = max(fit.best.sigma_px, fit.click_px) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
-    landmarks = fit.landmarks
     precise = _precise(fit)
-    found = refine_by_depth(precise, landmarks.points, landmarks.pixels, fit.best.state, sigma, depth, *deviations)
+    found, *others = _of_each_tilt(fit, precise, [fit.best.state, *alternatives], sigma, depth, deviations)
     best = found.estimate
+    alternatives = distinct_states(precise.model, best.state, [other.estimate.state for other in others])
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
     facts = {"along_the_sight_line": "by depth", "depth_scale": asdict(found.scale)}
     behind = share_behind(precise, best.state, depth * found.scale.factor, deviations[0])
     return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind, by_depth=found)
+
+
+def _of_each_tilt(
+    fit: LandmarkFit,
+    precise: Estimator,
+    starts: Sequence[State],
+    sigma: float,
+    depth: NDArray[np.float32],
+    deviations: tuple[float, float],
+) -> list[FoundByDepth]:
+    """What landmarks and depth (h, w) have together, from each state that the landmarks leave; the best first.
+
+    Others are as good only if as much of the depth belongs to the object there, and all fits as well.
+    """
+    landmarks, found, why = fit.landmarks, list[FoundByDepth](), None
+    off = OFF_SIGMAS * float(np.sqrt(fit.covariance[-1, -1]))
+    for state in starts:
+        asked = precise, landmarks.points, landmarks.pixels, state, sigma, depth, *deviations
+        try:
+            found.append(refine_by_depth(*asked, off=off if np.isfinite(off) else 0.0))
+        except RegistrationError as error:
+            why = why or error
+    if not found:
+        assert why is not None
+        raise why
+    nearest = max(one.share_near for one in found)
+    found = sorted((one for one in found if one.share_near > nearest - SAME_SHARE), key=lambda one: one.cost)
+    return [one for one in found if 2.0 * (one.cost - found[0].cost) < EXCLUDED]
 
 
 def _by_outline(fit: LandmarkFit, placed: _Placed, grey: NDArray[np.uint8]) -> _Placed:
@@ -253,6 +288,9 @@ def _warnings(fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None) -> lis
     fits = _of_residuals(fit, best, moved, placed.by_depth)
     if fits is not None and not (isinstance(fits, PoorFit) and contradiction is not None):
         found.append(fits)
+    by_depth = placed.by_depth
+    if by_depth is not None and abs(by_depth.deviations) > UNLIKELY and not isinstance(fits, DepthAgainstLandmarks):
+        found.append(DepthScaleUnlikely(100.0 * (by_depth.scale.factor - 1.0), abs(by_depth.deviations)))
     # Landmarks take up most of a depth that is shifted: that they fit says little.
     if placed.behind > SEEN_THROUGH and not isinstance(fits, DepthAgainstLandmarks):
         found.append(DepthBehindObject(100.0 * placed.behind))

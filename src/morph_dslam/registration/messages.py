@@ -141,6 +141,25 @@ class DepthAgainstLandmarks(RegistrationWarning):
 
 
 @dataclass(frozen=True)
+class DepthScaleUnlikely(RegistrationWarning):
+    """Landmarks and depth agree only if all depths are off by more than is likely.
+
+    Attributes
+    ----------
+    percent : by which the depths would have to be changed.
+    deviations : how many standard deviations of their scale that is.
+    """
+
+    template: ClassVar[str] = (
+        "landmarks and depth image fit together only if all depths are changed by {percent:+.1f} %, {deviations:.1f} "
+        "standard deviations of their scale: the mesh or the landmarks have another size than the object, or the focal "
+        "length or --depth-per-metre is off; places are off by as much as one of these is"
+    )
+    percent: float
+    deviations: float
+
+
+@dataclass(frozen=True)
 class DepthBehindObject(RegistrationWarning):
     """The depth camera sees through the object.
 

@@ -35,6 +35,8 @@ LARGEST_DISTANCE = 0.05
 SCALE_SIGMAS = 3.0
 #: Depth within this many pixels of the object's rim may belong to what is behind it.
 RIM_PX = 4
+#: Of an object so narrow that fewer pixels than this are farther inside, those nearer to the rim count.
+ENOUGH = 100
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,15 @@ class FoundByDepth:
     estimate : its covariance contains how well the scale of the depths is known.
     scale : of all depths, as landmarks and what is known of the depth camera have it.
     deviations : by which that scale differs from one, in the deviations that were known before.
+    cost : half of the sum of squares of all residuals, in deviations.
+    share_near : of the depths measured where the object is seen, those near to it.
     """
 
     estimate: Estimate
     scale: DepthScale
     deviations: float
+    cost: float
+    share_near: float
 
 
 def refine_by_depth(
@@ -62,6 +68,7 @@ def refine_by_depth(
     image: NDArray[np.float32],
     sigma_at_1m: float = SIGMA_AT_1M,
     scale_std: float = SCALE_STD,
+    off: float = 0.0,
 ) -> FoundByDepth:
     """The state of an object from landmarks and a depth image of the same view.
 
@@ -77,17 +84,18 @@ def refine_by_depth(
     image : (h, w) as recorded, metres, NaN where unknown.
     sigma_at_1m : standard deviation of a pixel's depth at 1 m, metres.
     scale_std : of what all depths are off by together, a share.
+    off : by how much more the landmarks may have it too near or too far, metres.
 
     Raises
     ------
     RegistrationError
         If there is hardly any depth where the landmarks have the object.
     """
-    fit, factor = None, 1.0
+    fit, factor, share_near = None, 1.0, 0.0
     for number in range(ROUNDS):
         # At first all of them may be off together, by what the scale of the depth camera may be.
-        off = 0.0 if number else SCALE_SIGMAS * scale_std
-        points, places, measured, near = _depths_in_view(estimator, state, image * factor, sigma_at_1m, off)
+        begin = (0.0, 0.0) if number else (SCALE_SIGMAS * scale_std, off)
+        points, places, measured, near = _depths_in_view(estimator, state, image * factor, sigma_at_1m, *begin)
         depths = measured.only(near)
         if depths.count < LEAST:
             ratio = measured.ratio_to(points.in_camera(state)[:, 2])
@@ -99,11 +107,11 @@ def refine_by_depth(
             )
         term = _term(estimator, state, points, places, depths).scaled(1.0 / factor)
         fit = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state, scale_std).minimum()
-        state, factor = fit.best.state, fit.scale.factor
+        state, factor, share_near = fit.best.state, fit.scale.factor, depths.count / measured.count
     assert fit is not None
     estimate = estimator.finished(fit.best, np.ones(len(pixels)), np.full(len(pixels), 2))
     estimate = replace(estimate, covariance=estimate.covariance + np.outer(fit.by_scale, fit.by_scale))
-    return FoundByDepth(estimate, fit.scale, fit.deviations)
+    return FoundByDepth(estimate, fit.scale, fit.deviations, fit.best.cost / sigma_px**2, share_near)
 
 
 @dataclass(frozen=True)
@@ -228,18 +236,24 @@ def _term(estimator: Estimator, state: State, points: BoundPoints, places: Array
 
 
 def _depths_in_view(
-    estimator: Estimator, state: State, image: NDArray[np.float32], sigma_at_1m: float, off: float = 0.0
+    estimator: Estimator,
+    state: State,
+    image: NDArray[np.float32],
+    sigma_at_1m: float,
+    share_off: float = 0.0,
+    off: float = 0.0,
 ) -> tuple[BoundPoints, Array, PointDepths, NDArray[np.bool_]]:
     """Points spread over what the camera sees of the surface, their pixels (p, 2), the depths, and which are near it.
 
-    Depths have weights in standard deviations. Those are near it too that are ``off`` by this share of the distance.
+    Depths have weights in standard deviations. Those are near it too that are off by ``share_off`` of the distance, and
+    ``off``, metres, more.
     """
     points, places = _surface_in_view(estimator, state)
     seen = np.ones(len(points), dtype=bool)
     depths = PointDepths.sampled(image, places, seen, estimator.camera, 1.0, sigma_at_1m)
     size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
     distances = points.in_camera(state)[:, 2]
-    near = np.abs(depths.depths - distances) < LARGEST_DISTANCE * size + off * distances
+    near = np.abs(depths.depths - distances) < LARGEST_DISTANCE * size + share_off * distances + off
     return points, places, depths, near
 
 
@@ -247,9 +261,14 @@ def _surface_in_view(estimator: Estimator, state: State) -> tuple[BoundPoints, A
     """Points spread over what the camera sees of the surface, and their pixels (p, 2)."""
     model, camera = estimator.model, estimator.camera
     view = view_of(model, camera, state)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_PX + 1,) * 2)
-    covered = cv2.erode(draw_view(view, model.triangles, camera).covered.astype(np.uint8), disc)
+    covered = draw_view(view, model.triangles, camera).covered.astype(np.uint8)
     rows, columns = np.nonzero(covered)
+    for rim in range(RIM_PX, 0, -1):
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1,) * 2)
+        inside = np.nonzero(cv2.erode(covered, disc))
+        if len(inside[0]) >= ENOUGH:
+            rows, columns = inside
+            break
     chosen = np.random.default_rng(0).permutation(len(rows))[:POINTS]
     pixels = np.column_stack([columns[chosen], rows[chosen]]).astype(float)
     surface, met = bind_pixels(model, camera, view, pixels)
