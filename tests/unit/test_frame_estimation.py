@@ -11,7 +11,7 @@ from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.registration.starts import shape_starts
 from morph_dslam.tracking.estimator import Estimate, EstimationOptions, Estimator, State
-from morph_dslam.tracking.frame_estimation import (
+from morph_dslam.tracking.frame_starts import (
     ShapeSearch,
     a_turn_back,
     at_constant_velocity,

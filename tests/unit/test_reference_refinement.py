@@ -107,22 +107,29 @@ def by_landmarks(seed, sigma_px=1.5):
 
 
 def test_depth_places_the_object_along_the_sight_line():
+    """Of a depth camera whose scale is known."""
     before, after = [], []
     for seed in range(4):
         landmarks, pixels, start = by_landmarks(seed)
         image = sheet_depth(MODEL, TRUTH, np.random.default_rng(seed))
-        found = refine_by_depth(Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image).estimate
+        asked = Estimator(MODEL, CAMERA), landmarks, pixels, start.state, 1.5, image
+        found = refine_by_depth(*asked, scale_std=0.0).estimate
         before.append(along_the_sight_line(start.state))
         after.append(along_the_sight_line(found.state))
-        # Along the sight line all depths may be off by one factor, which the landmarks know no better.
-        assert (found.pose_std[:3] < start.pose_std[:3]).all()
+        assert (found.pose_std < start.pose_std).all()
+        # One factor of all depths is a further unknown: landmarks know the distance no better by them.
+        assert (refine_by_depth(*asked).estimate.pose_std[:3] < start.pose_std[:3]).all()
     assert np.mean(before) > 1e-3
     assert np.mean(after) < 0.3e-3
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
-def test_depths_that_are_all_off_by_one_percent_place_it_one_deviation_off(factor):
-    """With the same noise, so that only the scale differs: in distance, and in all that changes with it."""
+def test_depths_that_are_all_off_by_a_factor_move_it_by_their_share_in_what_is_known(factor):
+    """With the same noise, so that only the scale differs: in distance, and in all that changes with it.
+
+    Of two normal measurements of one distance, each counts by its inverse variance: depths whose scale has the variance
+    s^2 have the share v / s^2 in an estimate of the variance v.
+    """
     landmarks, pixels, start = by_landmarks(0)
     image = sheet_depth(MODEL, TRUTH, np.random.default_rng(0))
     right, wrong = (
@@ -132,10 +139,12 @@ def test_depths_that_are_all_off_by_one_percent_place_it_one_deviation_off(facto
         for scale in (1.0, factor)
     )
     distance = right.state.camera_from_object.translation[2]
-    assert right.pose_std[-1] == pytest.approx(0.01 * distance, rel=0.2)
+    share = (right.pose_std[-1] / (0.01 * distance)) ** 2
+    assert 0.0 < share < 0.5
     there = wrong.state.camera_from_object
     turned = rotation_log(there.rotation @ right.state.camera_from_object.rotation.T)
     shifted = there.translation - right.state.camera_from_object.translation
+    assert shifted[2] == pytest.approx(share * (factor - 1.0) * distance, rel=0.3)
     off = np.concatenate([wrong.state.parameters - right.state.parameters, turned, shifted])
     assert (np.abs(off) < 1.2 * np.sqrt(np.diag(right.covariance))).all()
 

@@ -19,8 +19,8 @@ from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
-from morph_dslam.tracking.frame_estimation import new_filter
 from morph_dslam.tracking.frame_results import with_flat_sides, with_model_errors
+from morph_dslam.tracking.frame_starts import new_filter
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions

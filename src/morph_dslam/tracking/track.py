@@ -33,8 +33,8 @@ from morph_dslam.tracking.camera_check import CameraCheck
 from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options, check_times
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
-from morph_dslam.tracking.frame_estimation import temporal_facts
 from morph_dslam.tracking.frame_log import FrameLog, check_frame_log
+from morph_dslam.tracking.frame_starts import temporal_facts
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain

@@ -26,12 +26,6 @@ from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
 from morph_dslam.tracking.estimator import Estimator, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
-from morph_dslam.tracking.frame_estimation import (
-    a_turn_back,
-    at_constant_velocity,
-    new_filter,
-    with_unobservable_at_default,
-)
 from morph_dslam.tracking.frame_results import (
     lost_result,
     pose_source,
@@ -39,6 +33,12 @@ from morph_dslam.tracking.frame_results import (
     warnings_of_place,
     with_flat_sides,
     with_model_errors,
+)
+from morph_dslam.tracking.frame_starts import (
+    a_turn_back,
+    at_constant_velocity,
+    new_filter,
+    with_unobservable_at_default,
 )
 from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
