@@ -79,6 +79,15 @@ def test_the_other_tilt_is_as_often_the_right_one_as_stated(distance, share):
     assert unsure == pytest.approx(share, abs=0.1)
 
 
+def test_from_near_one_of_both_is_excluded():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        truth, found, other = tilts(rng, 1.0, rng.uniform(0.3, 0.6))
+        assert other.is_excluded == (angle(found, truth) < angle(other.state, truth) or other.angle < np.radians(2.0))
+    far = [tilts(rng, 12.0, rng.uniform(0.3, 0.6))[2].is_excluded for _ in range(20)]
+    assert np.mean(far) < 0.2
+
+
 def test_the_covariance_is_that_of_two_modes():
     """Of values at 0 and at d, with probabilities 1 - p and p: p (1 - p) d d'."""
     apart = np.array([0.0, 0.3, -0.2, 0.1, 0.01, 0.0, 0.02])

@@ -20,7 +20,7 @@ from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
 from morph_dslam.tracking.motion_blur import ReferenceBlur, blurred_paths, path_length
 from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, block_diagonal, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.other_tilt import EXCLUDED, LIKELIER, find_other_tilt
+from morph_dslam.tracking.other_tilt import LIKELIER, find_other_tilt
 from morph_dslam.tracking.outcomes import DepthNotUsed
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
@@ -167,7 +167,7 @@ class FrameEstimation:
                 lambda start, measured=measured: self._scout.minimum(*measured, start),
                 points, attempt.estimate.state, n_numbers, self._reference.redundancy,
             )  # fmt: skip
-            if other.ratio > EXCLUDED**2:
+            if other.is_excluded:
                 return attempt
         if other.ratio < -(LIKELIER**2):
             return self._trimmed(attempt.measurement, other.state, None)
@@ -183,7 +183,7 @@ class FrameEstimation:
             lambda start: self._scout.fitted(measured, start),
             self._reference.points, attempt.estimate.state, n_numbers, self._reference.redundancy,
         )  # fmt: skip
-        return replace(attempt, other_tilt=None if other.ratio > EXCLUDED**2 else other)
+        return replace(attempt, other_tilt=None if other.is_excluded else other)
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
         """Whether unknown loads take up more of the image than is left: then they may do what a parameter should."""

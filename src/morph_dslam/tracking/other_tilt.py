@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 #: The other tilt is taken if it is likelier by so many standard deviations, and excluded if it is less likely by
 #: as many as the second number.
 LIKELIER, EXCLUDED = 3.0, 5.0
+#: Two minima that are turned by less, rad, are one: from near, the mirrored tilt leads back to the estimate.
+SAME_MINIMUM = np.radians(2.0)
 #: Noise of a pixel coordinate is no smaller than this, pixels.
 LEAST_NOISE_PX = 0.05
 
@@ -44,6 +46,11 @@ class OtherTilt:
     def probability(self) -> float:
         """That it is the right one of both."""
         return float(1.0 / (1.0 + np.exp(0.5 * min(self.ratio, 1e3))))
+
+    @property
+    def is_excluded(self) -> bool:
+        """Whether there is none, or it is clearly less likely."""
+        return self.ratio > EXCLUDED**2 or self.angle < SAME_MINIMUM
 
     @property
     def spread(self) -> Array:
