@@ -19,10 +19,10 @@ from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.report import identification_lines, summarise
 from morph_dslam.identification.scatter import Design, joint_labels
 from morph_dslam.identification.values import FACTOR
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
+from morph_dslam.model import Parameter, ReducedModel, save_model
 from morph_dslam.model.functions import ParameterFunctions
+from tests.support.edge_plate import edge_plate
 
-CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 STRETCHES = np.linspace(0.1, 0.9, 8)
 
 
@@ -30,16 +30,7 @@ def plate() -> ReducedModel:
     """A plate of 1 m that is stretched by a along x, by a force of 100 a newtons."""
     a = Parameter("a", "length", "mm", 0.0, 1.0, 0.0)
     functions = ParameterFunctions(np.zeros(1), np.ones(1), np.array([[0], [1]]), np.full((2, 1), 0.5))
-    shape, force = np.zeros((1, 4, 3)), np.zeros((1, 1, 3))
-    shape[0, :, 0], force[0, 0, 0] = CORNERS[:, 0], 100.0
-    return ReducedModel(
-        "plate",
-        CORNERS,
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        (a,),
-        SeparatedField(shape, functions),
-        reactions={"force_edge": SeparatedField(force, functions)},
-    )
+    return edge_plate((a,), functions)
 
 
 def of_specimens(factors: list[float], noise: float, free_zero: bool = False, seed: int = 0) -> Identification:

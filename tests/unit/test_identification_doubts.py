@@ -23,9 +23,9 @@ from morph_dslam.identification.report import identification_lines, summarise
 from morph_dslam.identification.values import FACTOR
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
+from tests.support.edge_plate import CORNERS, edge_plate
 
 #: A plate of 1 m that is stretched by a along x, by a force of 100 a + 100 b a^2 newtons along it.
-CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def stretched_plate() -> ReducedModel:
@@ -34,16 +34,7 @@ def stretched_plate() -> ReducedModel:
     indices = np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]])
     stretch, bent = np.array([0.5, 0.5, 0, 0, 0, 0]), np.array([3.0, 4.0, 1.0, 3.0, 4.0, 1.0]) / 16.0
     functions = ParameterFunctions(np.zeros(2), np.ones(2), indices, np.column_stack([stretch, bent]))
-    shape, force = np.zeros((2, 4, 3)), np.zeros((2, 1, 3))
-    shape[0, :, 0], force[:, 0, 0] = CORNERS[:, 0], 100.0
-    return ReducedModel(
-        "plate",
-        CORNERS,
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        (a, b),
-        SeparatedField(shape, functions),
-        reactions={"force_edge": SeparatedField(force, functions)},
-    )
+    return edge_plate((a, b), functions)
 
 
 STRETCHES = np.linspace(0.05, 0.95, 19)

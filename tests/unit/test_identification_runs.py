@@ -15,29 +15,9 @@ from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.report import identification_lines, summarise
 from morph_dslam.identification.values import FACTOR
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField
-from morph_dslam.model.functions import ParameterFunctions
+from tests.support.edge_plate import plate_of_load
 
-#: A plate of 1 m that is stretched by load times a along x, by a force of 100 load a newtons.
-CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 LOADS = np.linspace(0.1, 0.9, 17)
-
-
-def plate() -> ReducedModel:
-    load, a = Parameter("load", "ratio", "1", 0.0, 1.0, 0.0), Parameter("a", "ratio", "1", 0.0, 1.0, 0.5)
-    # Chebyshev polynomials of x = 2 load - 1 and y = 2 a - 1: load a = (1 + x + y + x y) / 4.
-    indices = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-    functions = ParameterFunctions(np.zeros(2), np.ones(2), indices, np.full((4, 1), 0.25))
-    shape, force = np.zeros((1, 4, 3)), np.zeros((1, 1, 3))
-    shape[0, :, 0], force[0, 0, 0] = CORNERS[:, 0], 100.0
-    return ReducedModel(
-        "plate",
-        CORNERS,
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        (load, a),
-        SeparatedField(shape, functions),
-        reactions={"force_edge": SeparatedField(force, functions)},
-    )
 
 
 def run_of(loads: np.ndarray, stds: np.ndarray) -> Run:
@@ -48,7 +28,7 @@ def run_of(loads: np.ndarray, stds: np.ndarray) -> Run:
     covariances[:, 0, 0] = stds**2
     states = np.column_stack([loads, np.full(count, 0.5)])
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
-    return Run(plate(), camera, np.arange(count), words, words, poses, states, {}, covariances=covariances)
+    return Run(plate_of_load(), camera, np.arange(count), words, words, poses, states, {}, covariances=covariances)
 
 
 def by_frame(run: Run, forces: np.ndarray, free_zero: bool = False) -> MeasuredForces:

@@ -16,29 +16,9 @@ from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.scatter import Design, Noise, Scatter, directions
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField
-from morph_dslam.model.functions import ParameterFunctions
+from tests.support.edge_plate import CORNERS, plate_of_load
 
-#: A plate of 1 m that is stretched by load times a along x, by a force of 100 load newtons.
-CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 TRUTH, NOISE = 0.3, 0.003
-
-
-def plate() -> ReducedModel:
-    load, a = Parameter("load", "ratio", "1", 0.0, 1.0, 0.0), Parameter("a", "ratio", "1", 0.0, 1.0, 0.5)
-    # Chebyshev polynomials of x = 2 load - 1 and y = 2 a - 1: load a = (1 + x + y + x y) / 4.
-    indices = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-    functions = ParameterFunctions(np.zeros(2), np.ones(2), indices, np.full((4, 1), 0.25))
-    shape, force = np.zeros((1, 4, 3)), np.zeros((1, 1, 3))
-    shape[0, :, 0], force[0, 0, 0] = CORNERS[:, 0], 100.0
-    return ReducedModel(
-        "plate",
-        CORNERS,
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        (load, a),
-        SeparatedField(shape, functions),
-        reactions={"force_edge": SeparatedField(force, functions)},
-    )
 
 
 def points(loads: np.ndarray, rows: np.ndarray, rng: np.random.Generator, noise: float = NOISE) -> MeasuredPoints:
@@ -47,7 +27,7 @@ def points(loads: np.ndarray, rows: np.ndarray, rng: np.random.Generator, noise:
     places, load = np.tile(CORNERS[rows], (len(loads), 1)), np.repeat(loads, len(rows))
     measured = np.full_like(places, np.nan)
     measured[:, 0] = places[:, 0] * (1.0 + TRUTH * load) + noise * rng.normal(size=len(places))
-    return MeasuredPoints(plate(), states, {"load": load}, places, measured)
+    return MeasuredPoints(plate_of_load(), states, {"load": load}, places, measured)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -156,7 +136,7 @@ def test_noise_is_what_is_left_of_each_table() -> None:
 
 def test_few_forces_with_a_free_zero_have_wide_intervals() -> None:
     """Four forces, two unknowns: at least the interval of regression with two degrees of freedom."""
-    model, places = plate(), np.linspace(0.0, 1.0, 4)
+    model, places = plate_of_load(), np.linspace(0.0, 1.0, 4)
     for draw in range(5):
         forces = 100.0 * TRUTH * places + 1.0 + 0.5 * np.random.default_rng(draw).normal(size=4)
         table = MeasuredForces(model, ForceCurve("load", places, forces), reaction_in_direction(model, "edge:x"))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
 
 from morph_dslam.better_fit import chance_of_better_fit
@@ -67,8 +68,8 @@ def curve_factors(
     if np.count_nonzero([way.any() for way in ways]) < 2:
         return agree
     residuals = np.concatenate([part / std for part, std in zip(missed, noise.std, strict=True)])
-    own = np.hstack([design.slopes, _blocks(design.loose), residuals[:, None]])
-    columns = np.hstack([_blocks([way[:, None] for way in scaled]), errors.T, own])
+    own = np.hstack([design.slopes, np.asarray(block_diag(*design.loose)), residuals[:, None]])
+    columns = np.hstack([np.asarray(block_diag(*(way[:, None] for way in scaled))), errors.T, own])
 
     def whitened(values: Array, std: float) -> Array:
         factors = CurveFactors(std, scaled)
@@ -128,17 +129,7 @@ def noise_within(
     """
     residuals = np.concatenate([part / std for part, std in zip(missed, noise, strict=True)])
     loose = [scaled_directions(np.column_stack([q, way])) for q, way in zip(design.loose, ways, strict=True)]
-    basis = scaled_directions(np.hstack([design.slopes, _blocks(loose)]))
+    basis = scaled_directions(np.hstack([design.slopes, np.asarray(block_diag(*loose))]))
     left = residuals - basis @ (basis.T @ residuals)
     parts = [std * left[rows] for rows, std in zip(design.tables, noise, strict=True)]
     return Noise.shown(Design(design.slopes, design.known, loose, design.groups), parts, units, sizes)
-
-
-def _blocks(parts: Sequence[Array]) -> Array:
-    """Columns (n_j, q_j) of tables, each in its rows (n, q)."""
-    joint = np.zeros((sum(map(len, parts)), sum(part.shape[1] for part in parts)))
-    row = column = 0
-    for part in parts:
-        joint[row : row + len(part), column : column + part.shape[1]] = part
-        row, column = row + len(part), column + part.shape[1]
-    return joint

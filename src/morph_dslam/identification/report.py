@@ -248,21 +248,13 @@ def _weak(each: Mapping[str, Any], measurements: Sequence[Mapping[str, Any]]) ->
 
 def _model_errors(figures: Mapping[str, Any]) -> list[str]:
     """Which intervals are errors of the model or of a run, and where the model's file does not state all of its."""
-    said, half = [], np.sqrt(0.5)
-    if by_model := [
-        each["name"]
-        for each in figures["parameters"]
-        if each["standard_deviation_by_model"] > half * each["standard_deviation"]
-    ]:
+    said = []
+    if by_model := _mostly_by("model", figures):
         said.append(
             f"note: most of the interval of {', '.join(by_model)} is the model's own error: finer elements, or more "
             "training solutions, would narrow it"
         )
-    if by_run := [
-        each["name"]
-        for each in figures["parameters"]
-        if each["standard_deviation_by_run"] > half * each["standard_deviation"]
-    ]:
+    if by_run := _mostly_by("run", figures):
         said.append(
             f"note: most of the interval of {', '.join(by_run)} is by errors of the run's states, which all its frames "
             "have in common: a better known reference frame (more landmarks, --at-rest) would narrow it"
@@ -273,6 +265,16 @@ def _model_errors(figures: Mapping[str, Any]) -> list[str]:
             "state it"
         )
     return said
+
+
+def _mostly_by(cause: str, figures: Mapping[str, Any]) -> list[str]:
+    """The parameters more than half of whose variance has this cause."""
+    least = np.sqrt(0.5)
+    return [
+        each["name"]
+        for each in figures["parameters"]
+        if each[f"standard_deviation_by_{cause}"] > least * each["standard_deviation"]
+    ]
 
 
 def _measurement_lines(each: Mapping[str, Any]) -> list[str]:

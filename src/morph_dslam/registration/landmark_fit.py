@@ -15,6 +15,7 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks
 from morph_dslam.registration.messages import NotAtRest
 from morph_dslam.registration.other_values import as_set, plausible_minima
+from morph_dslam.registration.outline_snap import distinct_states
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
 from morph_dslam.registration.rig_check import cameras_contradict
@@ -22,7 +23,6 @@ from morph_dslam.registration.starts import pose_starts, shape_starts
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, State
 from morph_dslam.tracking.other_tilt import mirrored_tilt
 from morph_dslam.tracking.rig import PointsEstimator, RigCamera
-from morph_dslam.tracking.state import pose_increment
 
 Array = NDArray[np.float64]
 #: Least standard deviation of landmarks' pixels that is believed.
@@ -33,9 +33,8 @@ POOR_FIT, POOR_SHARE = 2.0, 1.0 / 800.0
 #: Largest residual (root mean square) as a share of the image's diagonal, and that of hints about an object whose edges
 #: give its place in the end: they need not be exact, but no mistakes.
 RESIDUAL_SHARE, HINT_RESIDUAL_SHARE = 0.005, 0.02
-
-#: The mirrored tilts of so many states are tried, and two states nearer than this, rad, have one tilt.
-MOST_TILTS, SAME_TILT = 8, 0.02
+#: The mirrored tilts of so many states are tried.
+MOST_TILTS = 8
 
 
 @dataclass(frozen=True)
@@ -135,23 +134,14 @@ def _with_other_tilts(
 
     Landmarks that lie nearly in a plane fit nearly as well there if they are far away, and PnP gives one tilt alone.
     """
-    points, tried, starts = landmarks.points, list[State](), list[State]()
-    for estimate in plausible_minima(found, click_px):
-        state = estimate.state
-        if len(starts) == MOST_TILTS or any(_alike(state, other) for other in tried):
-            continue
+    points, starts = landmarks.points, list[State]()
+    best, *others = (estimate.state for estimate in plausible_minima(found, click_px))
+    for state in [best, *distinct_states(estimator.model, best, others)][:MOST_TILTS]:
         positions = points.rest + points.field.value(state.parameters)
-        tried.append(state)
         starts.append(State(state.parameters, mirrored_tilt(positions, state.camera_from_object)))
     further = estimator.estimate_from(points, landmarks.pixels, np.ones(len(landmarks)), starts)
     further = [estimate for estimate in further if np.isfinite(estimate.residuals).all()]
     return sorted([*found, *further], key=lambda estimate: estimate.cost)
-
-
-def _alike(state: State, other: State) -> bool:
-    """Whether two states have about the same attitude."""
-    apart = pose_increment(state.camera_from_object, other.camera_from_object)
-    return float(np.linalg.norm(apart[:3])) < SAME_TILT
 
 
 def check_at_rest(

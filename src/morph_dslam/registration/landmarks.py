@@ -208,7 +208,7 @@ def _by_depth(
     alternatives = distinct_states(precise.model, best.state, [other.estimate.state for other in others])
     covariance = without_parameters(best.covariance) if at_rest else best.covariance
     facts = {"along_the_sight_line": "by depth", "depth_scale": asdict(found.scale)}
-    behind = share_behind(precise, best.state, depth * found.scale.factor, deviations[0])
+    behind = share_behind(precise, best.state, found.scale.corrected(depth), deviations[0])
     return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind, by_depth=found)
 
 

@@ -32,6 +32,10 @@ class DepthScale:
     factor: float = 1.0
     std: float = 0.0
 
+    def corrected(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A depth image (h, w), metres, in this scale."""
+        return depth if self.factor == 1.0 else depth * np.float32(self.factor)
+
 
 class KnownByDepth(Protocol):
     """What is known of a state, as residuals into which depths enter."""

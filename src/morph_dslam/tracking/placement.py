@@ -218,7 +218,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     placed = with_loads(registration, part.options)
     depth, scale = frames[0].depth if part.options.use_depth else None, registration.depth_scale
     if depth is not None and scale is not None:
-        depth = depth * np.float32(scale.factor)
+        depth = scale.corrected(depth)
     return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence, depth=depth)
 
 

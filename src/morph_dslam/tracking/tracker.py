@@ -22,6 +22,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring
 from morph_dslam.tracking.compilation import announce_compilation
+from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
 from morph_dslam.tracking.estimator import Estimator, Prior, State
@@ -163,8 +164,7 @@ class Tracker:
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._undistortion = camera.undistortion_maps()
         self._registration, self._seen, self._keyframes = registration, seen, keyframes
-        scale = registration.depth_scale
-        self._depth_factor = np.float32(1.0 if scale is None else scale.factor)
+        self._depth_scale = registration.depth_scale or DepthScale()
         use, sought = self.options.use_discrepancy, self.options.discrepancy
         self._discrepancy = DiscrepancyFit(self.model, camera, sought) if use else None
         self._filter = new_filter(self.estimator, self.options)
@@ -285,7 +285,7 @@ class Tracker:
             motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
             image = ready or picture.made_ready(self._undistortion)
             occluders = occluders_of(occluder_depth, self.camera, self._undistortion)
-            depth = None if picture.depth is None else picture.depth * self._depth_factor
+            depth = None if picture.depth is None else self._depth_scale.corrected(picture.depth)
             image = replace(image, depth=depth, occluder_depth=occluders, motion=motion, is_taken=self.is_taken)
             if self._views is None:
                 self._begin(image)
