@@ -42,6 +42,11 @@ class Rendering:
     triangle_ids: NDArray[np.int32]
 
 
+#: Reference pictures are enlarged so many times, by Lanczos' kernel. Bilinear interpolation between pixels of the
+#: picture itself shifts texture by up to some hundredths of a pixel, as far as it is from whole and half ones.
+FINER = 2
+
+
 class ReferenceAppearance:
     """Reference pictures as a texture.
 
@@ -66,12 +71,20 @@ class ReferenceAppearance:
         self._camera = camera
         sources = np.zeros(len(self._triangles), dtype=np.int64) if sources is None else sources
         # One picture below the other, so that a triangle's place says which one it is from.
-        self._texture = pack_texture(np.concatenate(normalized_images))
+        parts, below = [], 0
         self._coordinates = np.empty((len(self._triangles), 3, 3))
-        for number, view in enumerate(views):
+        for number, (image, view) in enumerate(zip(normalized_images, views, strict=True)):
             rows = sources == number
-            depths, below = view.nodes[:, 2:], np.array([0.0, number * camera.height])
-            self._coordinates[rows] = np.hstack([(view.pixels + below) * depths, depths])[self._triangles[rows]]
+            corners = self._triangles[rows]
+            part, corner = _finer_part(image, view.pixels[corners])
+            places = FINER * (view.pixels - corner) + 0.5 * (FINER - 1) + [0.0, below]
+            depths = view.nodes[:, 2:]
+            self._coordinates[rows] = np.hstack([places * depths, depths])[corners]
+            parts.append(part)
+            below += len(part)
+        width = max(part.shape[1] for part in parts)
+        of_one_width = [np.pad(part, ((0, 0), (0, width - part.shape[1])), mode="edge") for part in parts]
+        self._texture = pack_texture(np.concatenate(of_one_width))
 
     def render(self, view: View) -> Rendering:
         """The object alone, in another view of it."""
@@ -91,6 +104,20 @@ class ReferenceAppearance:
             triangle_ids,
         )
         return Rendering(grey, cv2.convertScaleAbs(grey), depth, triangle_ids)  # type: ignore[arg-type]
+
+
+def _finer_part(image: NDArray[np.uint8], pixels: Array) -> tuple[NDArray[np.uint8], Array]:
+    """The part of a picture (h, w) about pixels (..., 2), enlarged, and the pixel (2,) where it begins."""
+    inside = pixels[np.isfinite(pixels).all(axis=-1)]
+    height, width = image.shape
+    if not len(inside):
+        inside = np.zeros((1, 2))
+    margin = 8  # more than the kernel reaches
+    least = np.clip(np.floor(inside.min(axis=0)) - margin, 0, [width - 1, height - 1]).astype(np.int64)
+    most = np.clip(np.ceil(inside.max(axis=0)) + margin + 1, least + 1, [width, height]).astype(np.int64)
+    part = image[least[1] : most[1], least[0] : most[0]]
+    finer = cv2.resize(part, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LANCZOS4)
+    return finer, least.astype(np.float64)  # type: ignore[return-value]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -332,7 +332,7 @@ class Tracker:
             with stage("estimate"):
                 start = estimation.rough(followed, self._start, prior)
             hypothesis = estimation.correct(image, start, followed.offsets, prior)
-        return hypothesis
+        return estimation.correct_shape(image, hypothesis)
 
     def _search(self, hypothesis: PoseHypothesis) -> PoseHypothesis:
         """Try other shapes where the residuals are large, and the mirrored tilt, lest it stay in a local minimum."""
