@@ -1,5 +1,6 @@
 """Several objects, several cameras, and what goes with them, on rendered sheets with known states."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -437,6 +438,9 @@ def test_the_command_tracks_with_both_cameras(model, rig_recording_of_sheet, tmp
     assert "tracked=5/5" in capsys.readouterr().out
     run = load_run(tmp_path / "run")
     assert_follows_the_sheet(run, model)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["inputs"]["with"] == [str(folder / "aside")]
+    assert summary["new_reference_views"] == {"allowed": False, "made": 0, "frames_compared_with_them": 0}
     assert "has 2 cameras, but there are 3" in refused(
         *with_both_cameras(folder, tmp_path / "again", "--with", folder / "aside")
     )

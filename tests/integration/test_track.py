@@ -325,7 +325,7 @@ def test_a_named_point_is_followed(inputs, tmp_path):
         "--landmarks",
         inputs / FILES["landmarks"],
     ]
-    more = ["--range", "20-23", "--point", "end=210,0,0", "--no-video", "-o", tmp_path / "run"]
+    more = ["--range", "20-23", "--fps", "20", "--point", "end=210,0,0", "--no-video", "-o", tmp_path / "run"]
     assert main([str(word) for word in ("track", inputs / "frames", *files, *more)]) == 0
     model = load_run(tmp_path / "run").model
     node = int(np.linalg.norm(model.nodes - [0.21, 0.0, 0.0], axis=1).argmin())
@@ -335,6 +335,15 @@ def test_a_named_point_is_followed(inputs, tmp_path):
         found = [float(row[f"displacement_end_{axis}_mm"]) for axis in "xyz"]
         np.testing.assert_allclose(found, truth, atol=0.5)
     assert (tmp_path / "run" / "plots" / "points.png").is_file()
+    check_that_the_run_can_be_repeated(inputs, json.loads((tmp_path / "run" / "summary.json").read_text()))
+
+
+def check_that_the_run_can_be_repeated(inputs, summary):
+    """From what the summary says of its files and options."""
+    assert summary["inputs"] == {name: str(inputs / path) for name, path in FILES.items()}
+    asked = {"first": 20, "last": 23, "fps": 20.0, "points": [["end", [pytest.approx(0.21), 0.0, 0.0]]], "video": False}
+    left = {"snap": False, "at_rest": False, "time_zero": None, "refine_reference": False, "refine_camera": []}
+    assert summary["settings"].items() >= (asked | left).items()
 
 
 def test_parameter_that_is_one_over_the_sequence_is_named(inputs, finished, tmp_path):

@@ -19,6 +19,7 @@ from morph_dslam.tracking.frame_starts import (
     temporal_facts,
     with_unobservable_at_default,
 )
+from morph_dslam.tracking.load_prior import LoadOptions
 from morph_dslam.tracking.options import TrackerOptions
 from tests.support.bent_sheet import PARAMETERS, bent_sheet_model
 from tests.support.bent_tube import bent_tube
@@ -161,3 +162,11 @@ def test_facts_name_what_is_used_and_nothing_by_default():
         "from frame to frame: twist by 0.5 deg; none on the others"
     )
     assert facts["start_of_each_frame"] == "the state that the last two lead to at constant velocity"
+
+
+def test_facts_name_unknown_loads_that_go_on_from_the_frame_before():
+    """With a stated work each frame stands by itself."""
+    stated = EstimationOptions(loads=LoadOptions(work=1e-3))
+    found = {"temporal_prior": "unknown loads, from the frame before; none on the others"}
+    assert temporal_facts([], TrackerOptions(use_unknown_loads=True)).items() >= found.items()
+    assert temporal_facts([], TrackerOptions(use_unknown_loads=True, estimation=stated))["temporal_prior"] == "none"

@@ -136,6 +136,9 @@ def temporal_facts(parameters: Sequence[Parameter], options: TrackerOptions) -> 
         said.append(f"per-sequence parameters, from all frames so far: {', '.join(options.per_sequence)}")
     if walks:
         said.append(f"random walk, standard deviation of the change from frame to frame: {', '.join(walks)}")
+    # With a stated work each frame stands by itself.
+    if options.use_unknown_loads and options.estimation.loads.work is None:
+        said.append("unknown loads, from the frame before")
     start = "previous state; the first guess of image motion assumes constant velocity"
     if options.start == "constant-velocity":
         start = "the state that the last two lead to at constant velocity"

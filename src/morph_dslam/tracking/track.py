@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from morph_dslam.tracking.combinations import check_depth, check_inputs, check_o
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
 from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
 from morph_dslam.tracking.frame_log import FrameLog, check_frame_log
-from morph_dslam.tracking.frame_starts import temporal_facts
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.outcomes import ModelDoesNotExplain
@@ -49,8 +48,9 @@ from morph_dslam.tracking.placement import (
 )
 from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, landmark_deviation, refine_reference
 from morph_dslam.tracking.reregistration import Reregistration
+from morph_dslam.tracking.run_facts import run_facts
 from morph_dslam.tracking.run_folder import RunFolder
-from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
+from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
@@ -348,7 +348,7 @@ class _Job:
         run, folder, part = self._run, self._folders[number], self._placed[number]
         if not len(folder.results):
             return {}
-        facts = _facts(run, run.objects[number], part, folder.results)
+        facts = run_facts(run, number, part, folder.results)
         notices = [*part.registration.warnings, *self._again[part.name].notices, *map(Remark, self._notes)]
         of_camera = camera_doubts(part.camera) if part.object.scene is None else part.object.scene.camera_notes
         notices += [Remark(note) for note in of_camera]
@@ -477,28 +477,3 @@ def _refined(part: PlacedObject, keyframes: list[Keyframe], run: TrackOptions) -
         found = refine_discrepancy(fit, tracker.estimator, known, chosen)
         refined = replace(registration, discrepancy=found)
     return replace(part, registration=refined)
-
-
-def _facts(run: TrackOptions, files: ObjectOptions, part: PlacedObject, results: RunResults) -> dict[str, Any]:
-    """What the summary says of a run beside its results."""
-    named = {"frames": run.frames, "model": files.model, "camera": run.camera, "landmarks": files.landmarks}
-    named["reference_image"] = run.reference_image
-    scene, options = part.object.scene, part.options
-    named |= {"registration": files.registration, **vars(files.initializer), "map": scene and scene.path}
-    return temporal_facts(part.model.study_parameters, options) | {
-        "new_reference_views": {
-            "allowed": options.new_views,
-            "made": sum(result.made_view for result in results.results),
-            "frames_compared_with_them": sum(result.view > 0 for result in results.results),
-        },
-        "registration": part.registration.facts,
-        "inputs": {name: str(path) for name, path in named.items() if path is not None},
-        "reference_keyframes": part.reference_keyframes,
-        "reference_refined_over_the_sequence": results.refined,
-        "outline_used": options.use_outline or any(result.by_outline for result in results.results),
-        "depth_used": options.use_depth,
-        "discrepancy_used": options.use_discrepancy,
-        "unknown_loads_used": options.use_unknown_loads,
-        "pose": options.pose if scene is not None or options.pose == "still" else "free",
-        "settings": {"click_px": run.click_px, "tracker": asdict(options)},
-    }
