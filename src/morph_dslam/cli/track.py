@@ -225,7 +225,9 @@ def _not_counted(figures: dict[str, Any]) -> str:
 def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
     """What `add_tracking_arguments` asked for, and more.
 
-    What is asked for of parameters, the outline, inner structures and points holds for the first object only.
+    What names parameters, structures, points, moduli or the time of a model is of the first object's, and holds for
+    that only; so does what says that it has no texture. All else holds for every object: what is at rest, or snapped
+    to its outline, for those that start by landmarks.
     """
     from morph_dslam import TrackerOptions, TrackOptions
     from morph_dslam.extend.registration import InitializerFiles
@@ -237,6 +239,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         use_discrepancy=arguments.discrepancy,
         use_unknown_loads=arguments.unknown_loads is not None,
         estimation=EstimationOptions(loads=LoadOptions(work=arguments.unknown_loads or None)),
+        use_outline=arguments.outline,
         start=arguments.start,
         new_views=not arguments.one_view,
         further_views=not arguments.one_view,
@@ -248,12 +251,15 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
     others = []
     for name, model, start in arguments.also:
         is_registered = start.endswith(".json")
+        is_free = not is_registered and tracker.pose != "still"
         part = ObjectOptions(
             model=Path(model),
             landmarks=None if is_registered else Path(start),
             registration=Path(start) if is_registered else None,
+            at_rest=arguments.at_rest and not is_registered,
+            snap=arguments.snap and not is_registered,
             reregister_at=frames_of(name),
-            tracker=tracker if is_registered else replace(tracker, pose="map"),
+            tracker=replace(tracker, pose="map") if is_free else tracker,
         )
         others.append((name, part))
     unknown = {of for of, _, _ in arguments.reregister_at} - {"", *(name for name, _ in others)}
@@ -277,7 +283,6 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         reregister_at=frames_of(""),
         tracker=replace(
             tracker,
-            use_outline=arguments.outline or arguments.no_texture,
             use_texture=not arguments.no_texture,
             per_sequence=tuple(arguments.per_sequence),
             random_walk=_random_walk(arguments),
