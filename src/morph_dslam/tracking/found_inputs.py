@@ -20,7 +20,7 @@ from morph_dslam.sources import open_source
 #: Where a recording's images are kept by `morph simulate` and the studio.
 _FRAMES = "frames"
 #: Sections that only studies have.
-_OF_A_STUDY = {"mesh", "sheet", "shell"}
+_OF_A_STUDY = {"mesh", "sheet", "shell", "external"}
 #: Keys that only one kind of file has that says where an object is, by the option that takes it; scenes have them too.
 _STARTS = {"board": {"dictionary"}, "picture": {"image"}, "guess": {"pose"}}
 _OF_A_SCENE = {"sensor", "camera", "surface"}
@@ -53,7 +53,9 @@ class FoundInputs:
         chosen = [path for path in self.recordings if path.name == _FRAMES] or self.recordings
         if len(chosen) != 1:
             why = f"several recordings: {', '.join(map(str, chosen))}" if chosen else "no recording"
-            raise SourceError(f"{self.folder} holds {why}; give one in place of the folder, and name the other inputs")
+            raise SourceError(
+                f"{self.folder} holds {why}; give one of them in place of the folder, and name the other inputs"
+            )
         return chosen[0]
 
     @property
@@ -98,7 +100,7 @@ def find_inputs(folder: str | Path) -> FoundInputs:
     studies = tuple(path for path, keys in described.items() if _OF_A_STUDY & keys)
     places = [*_files(folder, ".json"), *sorted(folder.glob("*/registration.json"))]
     starts = [("registration", path) for path in places if "world_from_object" in _keys(path, json.loads)]
-    starts += [("landmarks", path) for path in _files(folder, ".csv") if set(HEADER) <= set(_first_row(path))]
+    starts += [("landmarks", path) for path in _files(folder, ".csv") if _first_row(path) == list(HEADER)]
     starts += [
         (name, path)
         for path, keys in described.items()
@@ -118,14 +120,14 @@ def _files(folder: Path, *endings: str) -> list[Path]:
 def _keys(path: Path, parse: Callable[[str], object]) -> set[str]:
     """Of the mapping that a file holds; none if it holds none."""
     try:
-        content = parse(path.read_text(encoding="utf-8"))
+        content = parse(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, yaml.YAMLError):
         return set()
     return {str(key) for key in content} if isinstance(content, dict) else set()
 
 
 def _first_row(path: Path) -> list[str]:
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         return [cell.strip() for cell in next(csv.reader(file), [])]
 
 
