@@ -4,7 +4,7 @@
     python benchmarks/results.py keep NAME LOG   # the same from the output of a run, kept in a file
     python benchmarks/results.py page            # write docs/results.md and the table in README.md
 
-Figures stand nowhere else in the documentation, so each is what a command has printed, with its date.
+Each figure of that page is what a command has printed, with its date.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
 PROJECT = Path(__file__).parents[1]
+#: Notebooks among the tutorials, whose pages are made from their source.
+NOTEBOOKS = sorted(path.stem for path in (PROJECT / "docs/tutorials").glob("*.py"))
 
 #: Public names by subject; names in no group come last.
 GROUPS = {
@@ -85,10 +87,10 @@ def on_files(files, config):
         "changelog.md": _from_root("CHANGELOG.md"),
         "contributing.md": _from_root("CONTRIBUTING.md"),
     }
-    for source in sorted((PROJECT / "docs/tutorials").glob("*.py")):
-        text = source.read_text()
-        name = f"tutorials/{source.stem}"
-        link = f"[Download as a notebook]({source.stem}.ipynb)"
+    for stem in NOTEBOOKS:
+        text = (PROJECT / f"docs/tutorials/{stem}.py").read_text()
+        name = f"tutorials/{stem}"
+        link = f"[Download as a notebook]({stem}.ipynb)"
         pages[f"{name}.md"] = notebook_page(text).replace("\n\n", f"\n\n{link}\n\n", 1)
         files.append(File.generated(config, f"{name}.ipynb", content=json.dumps(notebook(text))))
     for path, content in pages.items():
@@ -97,7 +99,8 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """A page of "How it works" ends with the functions that it refers to, unless another page has them."""
+    """Links to notebooks lead to their pages; "How it works" ends with the functions that no other page has."""
+    markdown = re.sub(rf"\]\(((?:[\w./-]*/)?(?:{'|'.join(NOTEBOOKS)}))\.py\)", r"](\1.md)", markdown)
     if not page.file.src_uri.startswith("how/"):
         return markdown
     names = dict.fromkeys(re.findall(r"\]\[(morph_dslam\.[\w.]+)\]", markdown))

@@ -137,6 +137,17 @@ def test_links_of_pages_outside_the_site_lead_somewhere():
                 assert fragment in map(anchor, headings), f"{page.name}: {name}#{fragment}"
 
 
+def test_links_of_pages_lead_to_files_of_the_project():
+    """They are read beside the source too; the reference, and copies of pages outside, are made with the site alone."""
+    n_links = 0
+    for page in (PROJECT / "docs").rglob("*.md"):
+        for name in re.findall(r"\]\(([\w./-]+\.\w+)(?:#[\w-]+)?\)", page.read_text()):
+            if not re.match(r"(\.\./)*(reference/|changelog|contributing)", name):
+                assert (page.parent / name).exists(), f"{page.name}: {name}"
+                n_links += 1
+    assert n_links > 300
+
+
 def test_commands_in_documents_have_these_options():
     """What the pages tell to type after `morph` is known to the command line; a # begins a remark."""
     known, n_options = {name: options(parser) for name, parser in commands().items()}, 0

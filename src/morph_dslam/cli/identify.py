@@ -22,7 +22,11 @@ KEPT = "nothing was written"
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add_file(command, "model", "model file of `morph build`", "MODEL")
     add_repeated(command, "--parameter", "a parameter of the model to identify", "NAME")
-    add_flag(command, "--moduli", "identify a common factor of all moduli, from forces")
+    add_flag(
+        command,
+        "--moduli",
+        "identify a common factor of all moduli, from forces, or from points under loads of known size",
+    )
     add_repeated(command, "--points", "points measured in some states, CSV (docs/identify.md)", "CSV", Path)
     add_repeated(
         command,

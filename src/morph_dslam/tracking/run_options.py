@@ -59,7 +59,8 @@ class TrackOptions(ObjectOptions):
     camera : camera file; of several cameras the first of a Kalibr camchain, "camchain.yaml#cam0".
     output : run folder of the first object; those of the others are in it.
     others : more objects, each with the name of its folder.
-    other_cameras : recordings of the other cameras of the camchain, in its order, with the same frame numbers.
+    other_cameras : recordings of the other cameras of the camchain, in its order; frames belong together by time where
+        all recordings have times of their own, else by number.
     other_landmarks : of the first object in the reference frames of those cameras, in the same order, of as many as
         have any.
     map_path : map that the objects are registered in; by default the one that each registration names.
