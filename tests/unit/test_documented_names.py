@@ -1,5 +1,6 @@
 """What the program accepts, writes and flags is documented, and what the documentation names exists."""
 
+import importlib
 import importlib.util
 import pydoc
 import re
@@ -12,8 +13,10 @@ from pydantic import BaseModel
 from morph_dslam.camera import Camera
 from morph_dslam.io.camera_files import _CameraFile
 from morph_dslam.mechanics.materials.library import constant_quantities, laws
+from morph_dslam.notices import Notice
 from morph_dslam.registration.board import BoardFile
 from morph_dslam.registration.guess import GuessFile
+from morph_dslam.registration.messages import RegistrationWarning
 from morph_dslam.registration.picture import PictureFile
 from morph_dslam.render.scene_file import Scene
 from morph_dslam.slam.run_files import write_run as write_slam_run
@@ -25,6 +28,7 @@ from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.tracking.outcomes import Status, TrackingWarning
 from morph_dslam.tracking.run_folder import summarise, write_csv, write_hdf5
+from morph_dslam.tracking.run_notices import RunWarning
 from morph_dslam.tracking.run_results import RunResults
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.documents import PAGES, PROJECT, code_words, commands, options
@@ -132,6 +136,21 @@ def test_every_status_and_warning_of_a_frame_is_documented():
     kinds = {kind.__name__ for kind in TrackingWarning.__subclasses__()}
     assert len(kinds) > 5
     assert (kinds | {status.value for status in Status}) - code_words("run-folder") == set()
+
+
+def kinds_below(root: type[Notice]) -> set[str]:
+    """Of all classes below one, as `notices` name them: ``at_bound`` for `AtBound`."""
+    classes = root.__subclasses__()
+    own = {re.sub(r"(?<!^)(?=[A-Z])", "_", one.__name__).lower() for one in classes}
+    return own.union(*map(kinds_below, classes))
+
+
+def test_every_warning_of_a_run_is_documented():
+    """By the kind that its entry in summary.json has."""
+    importlib.import_module("morph_dslam.tracking.still_notices")  # it has some of them
+    kinds = kinds_below(RegistrationWarning) | {warning.name.lower() for warning in RunWarning} | {"remark"}
+    assert {"not_at_rest", "focal_length_far_from_given", "by_outline", "rigid_fails"} < kinds
+    assert kinds - code_words("run-folder") == set()
 
 
 def test_results_are_those_that_were_kept(monkeypatch):
