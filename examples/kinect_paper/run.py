@@ -1,7 +1,7 @@
 """Track a real recording of a sheet of paper bent by two hands, and compare it with depth measurements.
 
 The recording (Varol, Salzmann, Fua and Urtasun, CVPR 2012) is not part of the project: a folder with the
-images `rgb/001.jpg` to `rgb/100.jpg` and the measured points `ground_truth.npz` (docs/run-folder.md). The
+images `rgb/001.jpg` to `rgb/100.jpg` and the measured points `ground_truth.npz` (docs/evaluation.md). The
 sheet's model is built once, from study.toml, and kept in output/. A recording of the same layout may bring
 its own camera.yaml and landmarks.csv.
 """

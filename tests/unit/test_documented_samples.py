@@ -47,6 +47,8 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("cameras", "yaml"): 1,
         ("certificate", "csv"): 1,
         ("export", "csv"): 1,
+        ("external-solutions", "csv"): 1,
+        ("external-solutions", "toml"): 2,
         ("record-your-own", "toml"): 2,
         ("record-your-own", "csv"): 1,
         ("registration-aids", "toml"): 3,
@@ -54,8 +56,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
         ("shell-study", "toml"): 2,
-        ("solid-study", "csv"): 1,
-        ("solid-study", "toml"): 11,
+        ("solid-study", "toml"): 9,
         ("study-file", "toml"): 1,
     }
 
@@ -330,10 +331,10 @@ def test_shape_of_a_solid():
 
 
 def test_solutions_of_another_program(tmp_path):
-    section, reactions = samples("solid-study", "toml")[-2:]
+    section, reactions = samples("external-solutions", "toml")
     study = make_study(tomllib.loads(section), tmp_path)
     assert isinstance(study, ExternalStudy)
-    (tmp_path / "parameters.csv").write_text(samples("solid-study", "csv")[0])
+    (tmp_path / "parameters.csv").write_text(samples("external-solutions", "csv")[0])
     table = SolutionTable(study.external.table)
     parameters, values = table.parameters()
     assert [parameter.name for parameter in parameters] == ["force", "tilt"]
@@ -365,6 +366,7 @@ def test_every_program_is_run_by_a_test():
     counts = {page: len(samples(page, "python")) for page in pages}
     assert {page: count for page, count in counts.items() if count} == {
         "certificate": 1,
+        "evaluation": 1,
         "export": 1,
         "material-tests": 1,
         "materials": 1,
@@ -372,7 +374,6 @@ def test_every_program_is_run_by_a_test():
         "model-file": 2,
         "own-program": 12,
         "record-your-own": 1,
-        "run-folder": 1,
         "scene-file": 1,
         "slam": 2,
         "solid-study": 3,
@@ -430,7 +431,7 @@ def test_evaluation_in_memory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.savez("truth.npz", **exact_truth(write_run(Path("run"))))
     before = sorted(tmp_path.rglob("*"))
-    in_frame = run_sample("run-folder")["in_frame"]
+    in_frame = run_sample("evaluation")["in_frame"]
     assert in_frame == pytest.approx(dict.fromkeys(("11", "12", "13", "14", "15"), 0.0), abs=1e-4)
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -13,7 +13,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     written = "the figures are written into it, those of FILE.txt beside it as FILE_evaluation.json and .png"
     add_file(command, "run_folder", f"run folder, or a trajectory file; {written}", "RUN")
     truth = command.add_mutually_exclusive_group(required=True)
-    add_file(truth, "--points", "truth file, .npz (docs/run-folder.md)", "TRUTH")
+    add_file(truth, "--points", "truth file, .npz (docs/evaluation.md)", "TRUTH")
     add_file(truth, "--pixels", "points followed in the images, CSV with frame,id,u,v", "TRACKS")
     truth.add_argument(
         "--force",
