@@ -252,6 +252,7 @@ def test_a_solid_is_tracked_by_its_outline_alone_on_request(built, filmed):
     summary = json.loads((built / "plain" / "summary.json").read_text())
     assert summary["n_tracked"] == summary["n_frames"]
     assert any("outline alone" in flag for flag in summary["flags"])
+    assert (summary["new_reference_views"]["allowed"], summary["new_reference_views"]["made"]) == (False, 0)
     assert set(load_run(built / "plain").status) == {"tracked"}
 
 
