@@ -12,6 +12,7 @@ from morph_dslam.model import SeparatedField
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import FewPointsAgree
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import WIDTH, bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
@@ -80,3 +81,30 @@ def test_half_a_sheet_is_followed_that_its_model_does_not_quite_describe(model):
     assert errors[:, hidden].mean() < 15e-3
     # The deviations that are stated say how far off it is.
     assert 0.5 < np.sqrt(np.mean((errors / deviations)[:, hidden] ** 2)) < 2.0
+
+
+def with_shifted_tiles(texture, rng, tile=44, most=5):
+    """The texture (h, w) in tiles that have moved by up to ``most`` pixels each."""
+    padded = np.pad(texture, most, mode="edge")
+    shifted = np.empty_like(texture)
+    for top in range(0, texture.shape[0], tile):
+        for left in range(0, texture.shape[1], tile):
+            down, right = rng.integers(-most, most + 1, 2) + most
+            height, width = texture[top : top + tile, left : left + tile].shape
+            part = padded[top + down : top + down + height, left + right : left + right + width]
+            shifted[top : top + tile, left : left + tile] = part
+    return shifted
+
+
+def test_points_that_agree_far_less_closely_than_before_are_named():
+    """As where dots of a regular print are taken for their neighbours: nearly all agree, by pixels."""
+    model, state = bent_sheet_model(22, 16), sheet_state(0.0)
+    film, rng = SheetFilm(model), np.random.default_rng(1)
+    tracker = Tracker(model, CAMERA, Registration(model, state), reference=film.frame(state))
+    for _ in range(3):
+        assert tracker.track(film.frame(state)).warning(FewPointsAgree) is None
+    film.texture = with_shifted_tiles(film.texture, rng)
+    result = tracker.track(film.frame(state))
+    assert result.tracked
+    assert result.n_inliers > 0.7 * result.n_points
+    assert result.warning(FewPointsAgree) is not None

@@ -113,14 +113,18 @@ class ObjectMoved(TrackingWarning):
 
 @dataclass(frozen=True)
 class FewPointsAgree(TrackingWarning):
-    """Few points agree, and less closely than usual: something may cover the object in part.
+    """Few points agree, and less closely than usual, or most of them far less closely.
+
+    Something may cover the object in part, or what looks alike was taken for it.
 
     Attributes
     ----------
     spread_px : robust spread of their residuals, pixels.
     """
 
-    template: ClassVar[str] = "few points agree, and less closely than usual: by {spread_px:.2g} px"
+    template: ClassVar[str] = (
+        "few points agree, and less closely than usual, or most of them far less closely: by {spread_px:.2g} px"
+    )
     spread_px: float
 
 

@@ -44,8 +44,9 @@ MOST_ROUNDS = 3
 MOST_TAKEN = 4
 #: So many standard deviations tell two places apart.
 SIGNIFICANT = 3.0
-#: Share of the latest frame in the usual spread.
-LEARNING_RATE = 0.05
+#: Share of the latest frame in the usual spread, which is no smaller than the second number, pixels: the reference
+#: picture itself, compared with its rendering, agrees as no other frame does.
+LEARNING_RATE, LEAST_USUAL_PX = 0.05, 0.1
 
 
 class Recovery:
@@ -69,10 +70,12 @@ class Recovery:
         if not np.isfinite(spread):
             return
         if np.isnan(self._usual_px):
-            self._usual_px = spread
+            self._usual_px = max(spread, LEAST_USUAL_PX)
         if self.partly_hidden(attempt):
             return
-        self._usual_px += LEARNING_RATE * (spread - self._usual_px)
+        # A frame that agrees far less closely does not make that usual at once.
+        self._usual_px += LEARNING_RATE * min(spread - self._usual_px, self._usual_px)
+        self._usual_px = max(self._usual_px, LEAST_USUAL_PX)
 
     def doubt(self, attempt: PoseHypothesis) -> float:
         """By how much, pixels, the points that agree may be off together; 0 where nothing is doubtful.
@@ -83,6 +86,8 @@ class Recovery:
         """
         if np.isnan(self._usual_px):
             return 0.0
+        if self.is_loose(attempt):
+            return float(np.sqrt(attempt.estimate.sigma_px**2 - self._usual_px**2))
         if self._known_by_map(attempt):  # fewer points tell as much
             if agree(attempt, self._options.least_share):
                 return 0.0
@@ -118,6 +123,12 @@ class Recovery:
         if not most:
             return max(CLOSE_PX, CLOSE_TO_USUAL * usual)
         return loosest if usual else np.inf
+
+    def is_loose(self, attempt: PoseHypothesis) -> bool:
+        """Whether points agree far less closely than usual: as where those of a regular print are taken for others."""
+        if attempt.outline_alone or np.isnan(self._usual_px):
+            return False
+        return attempt.estimate.sigma_px > max(LOOSE_PX, LOOSE_TO_USUAL * self._usual_px)
 
     def _known_by_map(self, attempt: PoseHypothesis) -> bool:
         """Whether the frame's camera and the map say where it is; a pose that is held says nothing of a frame."""
@@ -237,16 +248,22 @@ class Recovery:
     def jumped_to(self, picture: Image, followed: PoseHypothesis, last_shape: Array) -> PoseHypothesis | None:
         """The object where its features are, if most of its points agree there, and more closely than ``followed``.
 
-        It is looked for where fewer than half of the points agree of an object that is followed freely, and in doubt:
-        in the first of such frames and now and then. None where there is another one like it in the frame, too.
+        It is looked for where fewer than half of the points agree of an object that is followed freely, and in doubt,
+        or all far less closely than usual: in the first of such frames and now and then. None where there is another
+        one like it in the frame, too.
         """
         free = followed.prior is None and not followed.outline_alone
-        doubted = free and not agree(followed, MOST_AGREE) and self.doubt(followed) > 0.0
+        few = not agree(followed, MOST_AGREE)
+        doubted = free and self.doubt(followed) > 0.0 and (few or self.is_loose(followed))
         self._n_doubted = self._n_doubted + 1 if doubted else 0
         if not doubted or (self._n_doubted - 1) % self._options.look_every:
             return None
         found, _ = self._find_free(picture, self._shapes(last_shape), None)
-        if found is None or not agree(found, MOST_AGREE) or found.estimate.sigma_px >= followed.estimate.sigma_px:
+        if found is None:
+            return None
+        found, mistaken = self.unmistaken(picture, found)
+        agrees = agree(found, MOST_AGREE) and found.estimate.sigma_px < followed.estimate.sigma_px
+        if mistaken is not None or not agrees:
             return None
         return found if self.another(picture, found) is None else None
 

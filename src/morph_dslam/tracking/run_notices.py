@@ -57,9 +57,9 @@ class RunWarning(StrEnum):
         "alone give its pose; register it again to use the map"
     )
     FEW_AGREE = (
-        "few points agree, and less closely than usual, in {count} of {n_frames} frames, first in frame {first}: "
-        "something is before the object, it deforms otherwise than the model, or it was taken for what looks like it; "
-        "do not rely on these frames"
+        "few points agree, and less closely than usual, or most of them far less closely, in {count} of {n_frames} "
+        "frames, first in frame {first}: something is before the object, it deforms otherwise than the model, or it "
+        "was taken for what looks like it; do not rely on these frames"
     )
     TILT_AMBIGUOUS = (
         "in {count} of {n_frames} frames, first in frame {first}, the object may as well be tilted to the other side, "
