@@ -7,7 +7,7 @@ import pytest
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
-from morph_dslam.tracking.other_tilt import OtherTilt, find_other_tilt, mirrored_tilt
+from morph_dslam.tracking.other_tilt import LIKELIER, OtherTilt, find_other_tilt, mirrored_tilt
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA, UPRIGHT
@@ -88,12 +88,28 @@ def test_from_near_one_of_both_is_excluded():
     assert np.mean(far) < 0.2
 
 
-def test_the_covariance_is_that_of_two_modes():
-    """Of values at 0 and at d, with probabilities 1 - p and p: p (1 - p) d d'."""
+def test_what_is_added_is_the_mean_square_error_of_an_estimate_in_one_of_two_modes():
+    """The truth is at 0, where the estimate is, or at d, with probabilities 1 - p and p."""
     apart = np.array([0.0, 0.3, -0.2, 0.1, 0.01, 0.0, 0.02])
-    other = OtherTilt(State(np.zeros(1), RigidTransform.identity()), apart, ratio=2.0 * np.log(3.0))
-    assert other.probability == pytest.approx(0.25)
-    values = np.random.default_rng(0).choice([0.0, 1.0], 100_000, p=[0.75, 0.25])[:, None] * apart
-    np.testing.assert_allclose(other.spread, np.cov(values.T), atol=2e-3)
+    for odds in (3.0, 1.0 / 3.0):
+        other = OtherTilt(State(np.zeros(1), RigidTransform.identity()), apart, ratio=2.0 * np.log(odds))
+        p = 1.0 / (1.0 + odds)
+        assert other.probability == pytest.approx(p)
+        errors = np.random.default_rng(0).choice([0.0, 1.0], 100_000, p=[1.0 - p, p])[:, None] * apart
+        np.testing.assert_allclose(other.spread, errors.T @ errors / len(errors), atol=2e-3)
     assert other.angle == pytest.approx(np.linalg.norm(apart[1:4]))
     assert replace(other, ratio=1e5).spread.max() < 1e-100
+
+
+@pytest.mark.parametrize("likelier", [False, True])
+def test_an_estimate_is_as_far_off_as_stated_whichever_of_both_tilts_is_likelier(likelier):
+    """It stayed below half of it where the other tilt was the likelier one, and not clear enough to be taken."""
+    rng, stated, squared = np.random.default_rng(11), [], []
+    while len(stated) < 120:
+        truth, found, other = tilts(rng, 9.0, rng.uniform(0.3, 0.6))
+        if (other.probability > 0.5) != likelier or other.is_excluded or other.ratio < -(LIKELIER**2):
+            continue
+        stated.append(np.trace(other.spread[-6:-3, -6:-3]))
+        squared.append(other.angle**2 if angle(other.state, truth) < angle(found, truth) else 0.0)
+    # Both ways of 120: the mean of what is there or not is known to 15 %.
+    assert np.sqrt(np.mean(stated) / np.mean(squared)) == pytest.approx(1.0, abs=0.2)

@@ -1,8 +1,8 @@
 """The mirrored tilt: from afar a flat object looks nearly the same tilted to either side.
 
 Each of both tilts is a minimum of a frame's cost. Twice the difference of the costs, over the variance of a pixel
-coordinate, is the log-likelihood ratio. Where it does not exclude the other tilt, the estimate's distribution has two
-modes, and its covariance is that of both: with the other one's probability p at a distance d, p (1 - p) d d' more.
+coordinate, is the log-likelihood ratio. Where it does not exclude the other tilt, the truth has two modes, and the
+estimate stands in one: with the other one's probability p at a distance d, its mean square error is p d d' more.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class OtherTilt:
 
     @property
     def spread(self) -> Array:
-        """What it adds to the estimate's covariance (d + 6, d + 6)."""
-        return self.probability * (1.0 - self.probability) * np.outer(self.apart, self.apart)
+        """What it adds to the estimate's covariance (d + 6, d + 6): its mean square error, not that of both's mean."""
+        return self.probability * np.outer(self.apart, self.apart)
 
     @property
     def angle(self) -> float:
