@@ -1,16 +1,25 @@
 """The mirrored tilt of a flat object far away: how often it is the right one, against what is stated."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.registration.registration import Registration
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
+from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.hypothesis import PoseHypothesis
+from morph_dslam.tracking.measurement import Measurement
+from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.other_tilt import LIKELIER, OtherTilt, find_other_tilt, mirrored_tilt
+from morph_dslam.tracking.outcomes import FoundBy, TiltAmbiguous
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
-from tests.support.rendered_sequence import CAMERA, UPRIGHT
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm
 
 MODEL = bent_sheet_model(8, 6)
 FLAT = np.zeros(3)
@@ -23,16 +32,18 @@ def rigid_estimator():
     return estimator.within(replace(estimator.box, lower=FLAT, upper=FLAT))
 
 
-def tilts(rng, distance, tilt):
-    """The truth, the estimate from one of both tilts at random, and the other one."""
+def seen_frame(rng, distance, tilt):
+    """The truth of a frame, its points, and what finds the minimum of its cost from a start."""
     points, estimator = bound_points(MODEL, COUNT, rng), rigid_estimator()
     turn = rotation_exp(np.array([0.05, tilt, 0.1])) @ UPRIGHT
     truth = State(FLAT, RigidTransform(turn, np.array([0.1, -0.05, distance])))
     pixels = CAMERA.project(points.in_camera(truth)) + NOISE_PX * rng.standard_normal((COUNT, 2))
+    return truth, points, lambda start: estimator.minimum(points, pixels, np.ones(COUNT), start)
 
-    def minimum(start):
-        return estimator.minimum(points, pixels, np.ones(COUNT), start)
 
+def tilts(rng, distance, tilt):
+    """The truth, the estimate from one of both tilts at random, and the other one."""
+    truth, points, minimum = seen_frame(rng, distance, tilt)
     start = truth
     if rng.random() < 0.5:
         start = replace(truth, camera_from_object=mirrored_tilt(MODEL.nodes, truth.camera_from_object))
@@ -113,3 +124,70 @@ def test_an_estimate_is_as_far_off_as_stated_whichever_of_both_tilts_is_likelier
         squared.append(other.angle**2 if angle(other.state, truth) < angle(found, truth) else 0.0)
     # Both ways of 120: the mean of what is there or not is known to 15 %.
     assert np.sqrt(np.mean(stated) / np.mean(squared)) == pytest.approx(1.0, abs=0.2)
+
+
+def by_pixels_and_depth(rng, distance, depth_std):
+    """The truth, and attempts at a frame from one of both tilts at random: by its pixels, and with their depths."""
+    points, estimator, every = bound_points(MODEL, COUNT, rng), Estimator(MODEL, CAMERA), np.ones(COUNT)
+    turn = rotation_exp(np.array([0.05, rng.uniform(0.3, 0.6), 0.1])) @ UPRIGHT
+    truth = State(FLAT, RigidTransform(turn, np.array([0.1, -0.05, distance])))
+    pixels = CAMERA.project(points.in_camera(truth)) + NOISE_PX * rng.standard_normal((COUNT, 2))
+    start = truth
+    if rng.random() < 0.5:
+        start = replace(truth, camera_from_object=mirrored_tilt(MODEL.nodes, truth.camera_from_object))
+    view = SimpleNamespace(points=points, all_points=points, redundancy=1.0)
+    estimation = FrameEstimation(estimator, view, TrackerOptions())  # type: ignore[arg-type]
+    measurement = Measurement(pixels, pixels, every > 0.0, every > 0.0, every)
+    followed = PoseHypothesis(estimator.estimate(points, pixels, every, start), every > 0.0, measurement, every)
+    attempt = estimation.in_likelier_tilt(followed)
+    far = points.in_camera(truth)[:, 2] + depth_std * rng.standard_normal(COUNT)
+    depths = PointDepths(far, np.full(COUNT, NOISE_PX / depth_std), NOISE_PX**2, 2.0 * NOISE_PX)
+    found = estimator.estimate(points, pixels, every, attempt.estimate.state, depths=depths)
+    return truth, attempt, estimation.with_other_tilt(replace(attempt, estimate=found, depths=depths))
+
+
+def test_depth_that_contradicts_a_tilt_ends_it():
+    """It moved the estimate within its tilt, the wrong one in a third of the frames, and stated as certain."""
+    rng, before, after, stated = np.random.default_rng(3), [], [], []
+    for _ in range(60):
+        truth, by_pixels, with_depth = by_pixels_and_depth(rng, 6.0, 0.1)
+        before.append(angle(by_pixels.estimate.state, truth) > np.radians(12.0))
+        after.append(angle(with_depth.estimate.state, truth) > np.radians(12.0))
+        stated.append(0.0 if with_depth.other_tilt is None else with_depth.other_tilt.probability)
+    assert np.sum(before) > 15
+    assert np.sum(after) < 0.25 * np.sum(before)
+    stated = np.array(stated)
+    assert np.sum(after) == pytest.approx(stated.sum(), abs=3.3 * np.sqrt(np.sum(stated * (1.0 - stated))) + 0.6)
+
+
+def test_a_tilt_that_is_left_is_the_other_one_of_what_is_taken():
+    """As it is found from there."""
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        truth, points, minimum = seen_frame(rng, 7.0, rng.uniform(0.3, 0.6))
+        here = minimum(truth).state
+        other = find_other_tilt(minimum, points, here, 2 * COUNT, 1.0)
+        from_there, left = find_other_tilt(minimum, points, other.state, 2 * COUNT, 1.0), other.left(here)
+        assert left.ratio == pytest.approx(from_there.ratio, abs=1e-3)
+        assert left.probability == pytest.approx(1.0 - other.probability)
+        np.testing.assert_allclose(left.apart, from_there.apart, atol=1e-3)
+        assert angle(left.state, from_there.state) < 1e-3
+
+
+@pytest.mark.parametrize("tilt", [0.1, 0.15])
+def test_an_object_that_is_found_again_may_be_tilted_to_the_other_side_too(tilt):
+    """Where features found it, the other tilt was not asked for, though frames after this one leave it open."""
+    model = bent_sheet_model(22, 16)
+    film = SheetFilm(model)
+
+    def state(number, aside=0.0):
+        turn = rotation_exp(np.array([0.05, tilt + 0.01 * number, 0.05 * number])) @ UPRIGHT
+        return State(FLAT, RigidTransform(turn, np.array([aside, 0.0, 3.2])))
+
+    known = Registration(model, state(0))
+    tracker = Tracker(model, CAMERA, known, TrackerOptions(new_views=False), reference=film.frame(state(0)))
+    tracker.track(film.frame(state(1)))
+    assert tracker.track(film.blank()).status == "lost"
+    result = tracker.track(film.frame(state(3, aside=0.5)))
+    assert (result.status, result.found_by) == ("tracked", FoundBy.FEATURES)
+    assert result.warning(TiltAmbiguous) is not None

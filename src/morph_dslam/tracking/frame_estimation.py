@@ -178,9 +178,10 @@ class FrameEstimation:
     def in_likelier_tilt(self, attempt: PoseHypothesis) -> PoseHypothesis:
         """The attempt, or a clearly likelier explanation in the mirrored tilt; with both if neither is excluded.
 
-        Where something else knows the pose there is nothing to ask.
+        Its points are asked once, and where something else knows the pose there is nothing to ask.
         """
-        if attempt.prior is not None or attempt.outline_alone or not attempt.estimate.sigma_px < np.inf:
+        is_known = attempt.prior is not None or attempt.tilt_asked
+        if is_known or attempt.outline_alone or not attempt.estimate.sigma_px < np.inf:
             return attempt
         for measured in self._few_and_all(attempt):
             points, n_numbers = measured[0], 2 * int(attempt.measurement.valid.sum())
@@ -189,13 +190,17 @@ class FrameEstimation:
                 points, attempt.estimate.state, n_numbers, self._reference.redundancy,
             )  # fmt: skip
             if other.is_excluded:
-                return attempt
+                return replace(attempt, tilt_asked=True)
         if other.ratio < -(LIKELIER**2):
-            return self._trimmed(attempt.measurement, other.state, None)
-        return replace(attempt, other_tilt=other)
+            taken, other = other.state, other.left(attempt.estimate.state)
+            attempt = self._trimmed(attempt.measurement, taken, None)
+        return replace(attempt, tilt_asked=True, other_tilt=None if other.is_excluded else other)
 
     def with_other_tilt(self, attempt: PoseHypothesis) -> PoseHypothesis:
-        """The attempt with the other tilt as all that was measured has it, outline and depth too, if not excluded."""
+        """The attempt, or what is clearly likelier by all that was measured, outline and depth too, in the other tilt.
+
+        With both if neither is excluded.
+        """
         if attempt.other_tilt is None or attempt.prior is not None:
             return replace(attempt, other_tilt=None)
         measured = self.measured(attempt, correlated=False)
@@ -204,6 +209,9 @@ class FrameEstimation:
             lambda start: self._scout.fitted(measured, start),
             self._reference.points, attempt.estimate.state, n_numbers, self._reference.redundancy,
         )  # fmt: skip
+        if other.ratio < -(LIKELIER**2):
+            taken, other = other.state, other.left(attempt.estimate.state)
+            attempt = replace(attempt, estimate=self._estimator.fit(measured, taken))
         return replace(attempt, other_tilt=None if other.is_excluded else other)
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:

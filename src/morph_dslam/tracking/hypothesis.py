@@ -84,6 +84,7 @@ class PoseHypothesis:
     blurred : (p, 2), the paths over which motion smears the points that support it, pixels, see `blurred_paths`; None
         where it does no harm, or is not known.
     other_tilt : the mirrored tilt, where what was measured does not exclude it.
+    tilt_asked : whether the points were asked for it.
     reference_blur_px : the root mean square length of the paths over which motion smears the reference picture, pixels;
         0 where it does no harm, or is not known.
     """
@@ -100,6 +101,7 @@ class PoseHypothesis:
     n_absent: int = 0
     blurred: Array | None = None
     other_tilt: OtherTilt | None = None
+    tilt_asked: bool = False
     reference_blur_px: float = 0.0
 
     @property

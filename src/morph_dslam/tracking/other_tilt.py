@@ -62,6 +62,10 @@ class OtherTilt:
         """By which the object is turned from the one to the other, rad."""
         return float(np.linalg.norm(self.apart[-6:-3]))
 
+    def left(self, state: State) -> OtherTilt:
+        """The tilt of an estimate's ``state``, where this one is taken in its place."""
+        return OtherTilt(state, -self.apart, -self.ratio)
+
 
 def find_other_tilt(
     minimum: Callable[[State], Minimum], points: BoundPoints, state: State, n_numbers: int, redundancy: float

@@ -380,6 +380,8 @@ class Tracker:
     def _refine(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
         """Add outline, depth, what earlier frames tell of per-sequence parameters, and the discrepancy."""
         estimation = self._view.estimation
+        with stage("search"):  # of one that was found otherwise than by `_search`, too
+            hypothesis = estimation.in_likelier_tilt(hypothesis)
         with stage("outline"):
             hypothesis = estimation.fit_outline(image, hypothesis)
         with stage("depth"):
