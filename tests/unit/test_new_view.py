@@ -44,6 +44,20 @@ def scene():
     return film, view, attempt
 
 
+@pytest.mark.parametrize("distance", [0.62, 2.0])
+def test_points_of_the_texture_count_as_one_by_their_windows_whether_or_not_an_outline_counts_too(distance):
+    """The share of two squares of 15 pixels that is the same, summed; the outline's 160 points diluted it."""
+    film = SheetFilm(bent_sheet_model(22, 16))
+    turn = sheet_state(0.1).camera_from_object.rotation
+    known = State(sheet_state(0.1).parameters, RigidTransform(turn, np.array([0.0, 0.0, distance])))
+    seen, estimator = PosedImage(picture(film.frame(known)), known), Estimator(film.model, CAMERA)
+    for use_outline in (False, True):
+        view = ReferenceView(estimator, [seen], replace(OPTIONS, use_outline=use_outline))
+        apart = np.abs(view.pixels[:, None] - view.pixels[None])
+        alike = np.prod(np.maximum(1.0 - apart / 15.0, 0.0), axis=2)
+        assert view.redundancy == pytest.approx(alike.sum() / len(view.points), rel=1e-3)
+
+
 def fit(view, made, attempt, unexplained_px=0.1, spread=0.01, **changed):
     estimate = replace(attempt.estimate, **changed)
     attempt, half = replace(attempt, estimate=estimate), PATCH_HALF

@@ -288,10 +288,11 @@ class ReferenceView:
             found += int(_on_texture(view.picture, places).sum())
         return found
 
-    @property
+    @cached_property
     def redundancy(self) -> float:
-        """How many of the points count as one, because their windows overlap."""
-        return float(self.correlation.sum() / len(self.all_points))
+        """How many of the texture's points count as one, because their windows overlap; of an outline alone 1."""
+        count = len(self.points)
+        return float(scipy.sparse.csr_array(self.correlation)[:count, :count].sum() / count) if count else 1.0
 
     @property
     def nothing_measured(self) -> Observations:
