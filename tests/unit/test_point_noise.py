@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.tracking.covariance import LEAST_SPREAD_PX, huber_covariance
-from morph_dslam.tracking.noise import LARGEST_POWER, PointNoise
+from morph_dslam.tracking.noise import LARGEST_POWER, Observations, PixelNoise, PointNoise
 
 
 def learnt(factor, common_px, frames=60, count=300, seed=0):
@@ -118,3 +118,23 @@ def test_few_or_equal_points_teach_nothing():
     noise.learn(spread, np.ones((300, 2)), few)
     noise.learn(np.full(300, 0.1), np.ones((300, 2)), np.ones(300, dtype=bool))
     assert np.isinf(noise.common)
+
+
+@pytest.mark.parametrize("lasting", [1.0, 0.5])
+@pytest.mark.parametrize("of_outline", [False, True])
+def test_what_stays_with_points_is_told_from_what_is_new(of_outline, lasting):
+    """Of errors of variance one; a point of an outline, which is off across it alone, gives one number."""
+    rng, count, found = np.random.default_rng(6), 160, []
+    around = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    normals = np.column_stack([np.cos(around), np.sin(around)]) * of_outline
+    points = None  # whose they are does not matter
+    seen = Observations(points, np.zeros((count, 2)), np.ones(count), normals, np.eye(count))  # type: ignore[arg-type]
+    for _ in range(10):
+        stays, noise = rng.standard_normal((count, 2)), PixelNoise(memory=600.0)
+        for _ in range(100):
+            errors = np.sqrt(lasting) * stays + np.sqrt(1.0 - lasting) * rng.standard_normal((count, 2))
+            if of_outline:
+                errors = np.sum(errors * normals, axis=1)[:, None] * normals
+            noise.add(errors, seen, taken=0.0)
+        found.append([noise.common, noise.frame])
+    np.testing.assert_allclose(np.mean(found, axis=0), [lasting, 1.0 - lasting], atol=0.12)

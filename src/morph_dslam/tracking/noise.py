@@ -185,8 +185,9 @@ class PixelNoise:
         total = max(np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1), LEAST_SPREAD_PX**2)
         if self._before is not None:
             products = residuals * self._before
-            pairs = np.isfinite(products)
-            self._count = self._fade * self._count + pairs.sum()
+            pairs = np.isfinite(products).all(axis=1)
+            # A point of an outline is off across it alone: its pair of products is that of one number.
+            self._count = self._fade * self._count + measured.numbers[pairs].sum()
             self._product = self._fade * self._product + np.nansum(products)
         self._before = residuals
         # As long as there is nothing to compare with, all of it is taken to stay.
