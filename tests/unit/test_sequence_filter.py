@@ -9,14 +9,16 @@ import scipy.sparse
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
-from morph_dslam.registration.registration import PosePrior
+from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
 from morph_dslam.tracking.noise import block_diagonal, window_correlation
+from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.sequence_filter import PointChange, SequenceFilter
 from morph_dslam.tracking.still import held
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
-from tests.support.rendered_sequence import CAMERA
+from tests.support.rendered_sequence import CAMERA, SheetFilm
 
 MODEL = bent_sheet_model(22, 16)
 ESTIMATOR = Estimator(MODEL, CAMERA)
@@ -165,6 +167,28 @@ def test_walking_parameter_is_smoothed_as_much_as_its_step_says():
     assert 0.7 < np.sqrt(np.mean((smooth[:, 0] / smooth[:, 1]) ** 2)) < 1.4
     # What the frame alone tells is kept beside it.
     assert np.median(stated) == pytest.approx(own, rel=0.2)
+
+
+def test_a_parameter_walks_on_while_the_object_is_lost():
+    """As in a scalar Kalman filter, by the deviation of a frame alone and that before the loss."""
+    film, state, step = SheetFilm(MODEL), truth(0), 1e-4
+    first, blank = film.frame(state), film.blank()
+    seen = [film.frame(state, noise=12.0) for _ in range(8)]
+
+    def deviations(n_blank=0, n_without=0, steps=()):
+        """Of the twist before and after so many frames without the object, and so many instants without a frame."""
+        options = TrackerOptions(random_walk=steps)
+        tracker = Tracker(MODEL, CAMERA, Registration(MODEL, state), options, reference=first)
+        before = [tracker.track(frame) for frame in seen[:-1]][-1]
+        assert all(tracker.track(blank).status == "lost" for _ in range(n_blank))
+        assert all(tracker.pass_over(None).status == "lost" for _ in range(n_without))
+        return [result.estimate.parameter_std[TWIST] for result in (before, tracker.track(seen[-1]))]
+
+    own = deviations(n_without=1)[1]
+    for n_blank, n_without in ((3, 0), (0, 20)):
+        before, after = deviations(n_blank, n_without, (("twist", step),))
+        predicted = before**2 + (n_blank + n_without + 1) * step**2
+        assert after == pytest.approx(np.sqrt(1.0 / (1.0 / own**2 + 1.0 / predicted)), rel=0.02)
 
 
 def test_wrong_early_value_is_given_up():

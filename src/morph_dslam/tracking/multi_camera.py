@@ -220,6 +220,7 @@ class RigTracker:
             modulus_std=self.options.modulus_std,
         )
         if estimate is None:
+            self._filter.go_on()
             return result
         for tracker, part in zip(self.trackers, self.cameras, strict=True):
             tracker.continue_from(part.seen(estimate.state))

@@ -252,6 +252,13 @@ class SequenceFilter(Generic[Frame]):
         if self._past is not None:
             self._past = self._past.with_points(change, self._kept)
 
+    def go_on(self) -> None:
+        """Take a step of what walks, for a frame that tells nothing; `fuse` does so for its own."""
+        past = self._past
+        if past is not None:
+            covariance, by_frames = past.covariance + self._step, past.by_frames + self._step
+            self._past = replace(past, covariance=covariance, by_frames=by_frames)
+
     def fuse(self, measured: Frame, alone: Estimate, known: Prior | None = None) -> Estimate:
         """The estimate of a frame from its measurements and all frames before, with its covariance.
 
@@ -278,6 +285,7 @@ class SequenceFilter(Generic[Frame]):
             return by_itself
         self.keeps = not conflict
         if conflict and (self._walks or not self._is_far_surer(self._past, by_itself)):
+            self.go_on()
             return by_itself
         past = self._prior(self._past, measured, errors, linear)
         self.past_information[:-6, :-6] = past.information
@@ -357,14 +365,15 @@ class SequenceFilter(Generic[Frame]):
         fades, k = self._fading(), self._kept
         self._past = _Past(
             estimate.state.parameters[k],
-            fades @ self._of_kept(errors.covariance) @ fades.T + self._step,
+            fades @ self._of_kept(errors.covariance) @ fades.T,
             errors.by_point[:, :, k] @ fades.T,
-            fades @ self._of_kept(errors.by_frames) @ fades.T + self._step,
+            fades @ self._of_kept(errors.by_frames) @ fades.T,
             errors.by_factor[:, k] @ fades.T,
             fades @ self._of_kept(errors.unseen) @ fades.T,
             {view: rows[:, k] @ fades.T for view, rows in errors.by_views.items()},
             {} if self._past is None else self._past.left,
         )
+        self.go_on()
 
     def _fading(self) -> Array:
         """By which errors of the kept parameters (k, k) grow from one frame to the next; what a frame shows fades."""

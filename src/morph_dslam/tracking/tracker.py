@@ -416,6 +416,7 @@ class Tracker:
         if rejection is None:
             self._learn(image, hypothesis)
         else:
+            self._filter.go_on()
             self.last_measured, self.last_blurred = self.reference.nothing_measured, None
             if self.estimator.loads is not None:
                 self.estimator.loads.forget()
@@ -501,6 +502,7 @@ class Tracker:
         """
         self._history.motion(timestamp)
         self._history.add(None)
+        self._filter.go_on()
         if timestamp is not None:
             self._gaps.after_gap(timestamp)
         self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
