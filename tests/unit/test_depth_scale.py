@@ -37,9 +37,9 @@ def measured(points):
 
 def pushed(scale, points, found, past, depths, prior=None):
     """By the linear theory: how the estimate moves for one deviation of the scale."""
-    push, of_depths = scale.push(points, found.state, past, depths)
+    push = scale.push(points, found.state, past, depths)
     pixels = CAMERA.project(points.in_camera(TRUTH))
-    hessian = ESTIMATOR.evaluate(points, pixels, np.ones(len(points)), found.state, None, prior)[1] + of_depths
+    hessian = ESTIMATOR.evaluate(points, pixels, np.ones(len(points)), found.state, None, prior, depths)[1]
     return np.linalg.solve(hessian, push)
 
 
@@ -71,6 +71,5 @@ def test_it_does_not_average_out_over_frames():
 def test_where_the_reference_has_it_already_it_counts_once():
     points = bound_points(MODEL, 10, np.random.default_rng(0))
     nothing = np.zeros((len(ESTIMATOR.scale),) * 2)
-    push, of_depths = CommonDepthScale(0.0, ESTIMATOR.scale).push(points, TRUTH, nothing, measured(points))
+    push = CommonDepthScale(0.0, ESTIMATOR.scale).push(points, TRUTH, nothing, measured(points))
     assert not push.any()
-    assert not of_depths.any()

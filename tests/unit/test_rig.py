@@ -231,10 +231,11 @@ def bound_in(model, part, reference, state):
     return BoundPoints.from_surface(model, surface)
 
 
-def estimated(model, pictures):
+def estimated(model, pictures, depth_weight=None):
     """What exact measurements of a later frame lead to, and by what.
 
-    Each of ``pictures`` has the reference state, what it was taken for, and the factors (9, c) of that error.
+    Each of ``pictures`` has the reference state, what it was taken for, and the factors (9, c) of that error. With
+    ``depth_weight``, pixels per metre, each camera measures depth too.
     """
     views, trackers = [], []
     estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
@@ -243,7 +244,9 @@ def estimated(model, pictures):
         every = [bound_in(model, part, true, taken) for true, taken, _ in pictures]
         true_points, points = (reduce(BoundPoints.joined, parts) for parts in (every_true, every))
         pixels = part.camera.project(true_points.in_camera(part.seen(LATER)))
-        views.append(measured(points, pixels))
+        far = true_points.in_camera(part.seen(LATER))[:, 2]
+        depths = None if depth_weight is None else PointDepths(far, np.full(len(far), depth_weight), 1.0, 1e6)
+        views.append(measured(points, pixels, depths=depths))
         ends, parts = np.cumsum([len(own) for own in every]), []
         for own, end, (_, taken, error_factors) in zip(every, ends, pictures, strict=True):
             seen = None if error_factors is None else part.chain(len(model.parameters)) @ error_factors
@@ -254,10 +257,10 @@ def estimated(model, pictures):
     return estimator.fit(seen, LATER), seen, trackers
 
 
-def check_prediction(model, pictures):
-    found, seen, trackers = estimated(model, pictures)
+def check_prediction(model, pictures, depth_weight=None):
+    found, seen, trackers = estimated(model, pictures, depth_weight)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = RigErrors(trackers, RIG).added(plain, seen, None, [0.0] * len(RIG)).covariance
+    stated = RigErrors(trackers, RIG, depth_std=0.0).added(plain, seen, None, [0.0] * len(RIG)).covariance
     assert_moved_as_stated(LATER, found.state, stated, trackers[0].estimator.scale)
 
 
@@ -280,6 +283,11 @@ def assert_moved_as_stated(before, after, stated, scale):
 @pytest.mark.parametrize("step", STEPS)
 def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, step):
     check_prediction(model, [(REFERENCE, moved(REFERENCE, step), step[:, None])])
+
+
+@pytest.mark.parametrize("step", STEPS[[1, 3, 8]])
+def test_depths_hold_a_rig_s_estimate_against_an_error_of_the_reference_as_predicted(model, step):
+    check_prediction(model, [(REFERENCE, moved(REFERENCE, step), step[:, None])], depth_weight=2000.0)
 
 
 @pytest.mark.parametrize("step", STEPS)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import (
     ALIKE_SHARE,
@@ -16,11 +17,12 @@ from morph_dslam.tracking.covariance import (
     gaussian_factor,
     trace_of_share,
 )
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, ReferenceMisfit
 from morph_dslam.tracking.sequence_filter import SequenceFilter
-from morph_dslam.tracking.state import moved
+from morph_dslam.tracking.state import moved, pose_increment
 from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
 from tests.support.bent_sheet import bent_sheet_model
@@ -298,6 +300,57 @@ def test_an_error_of_the_reference_stays_in_a_shared_parameter_as_predicted(mode
         )
         off_by = abs(fused.state.parameters[0] - 0.03)
         assert stated.parameter_std[0] == pytest.approx(off_by, rel=0.1), time
+
+
+def rim(model, state):
+    """The sheet's rim as points of an outline, their places in the image, and the normals there (p, 2)."""
+    half = np.abs(model.nodes[:, :2]).max(axis=0)
+    on_rim = np.abs(model.nodes[:, :2]) > half - 1e-9
+    nodes = np.flatnonzero(on_rim.any(axis=1))
+    triangles, corners = np.array([np.argwhere(model.triangles == node)[0] for node in nodes]).T
+    points = BoundPoints.from_surface(model, SurfacePoints(triangles, np.eye(3)[corners]))
+    outwards = 1e-3 * np.where(on_rim[nodes], np.sign(model.nodes[nodes, :2]), 0.0)
+    turned = np.column_stack([outwards, np.zeros(len(nodes))]) @ state.camera_from_object.rotation.T
+    places, beside = (CAMERA.project(points.in_camera(state) + step) for step in (0.0, turned))
+    normals = (beside - places) / np.linalg.norm(beside - places, axis=1)[:, None]
+    return points, places, normals
+
+
+@pytest.mark.parametrize("other", ["depth", "outline"])
+def test_what_holds_an_estimate_beside_its_points_holds_it_against_the_reference_s_error(
+    model, estimator, pixels, other
+):
+    """By exact measurements: the estimate moves as stated."""
+    true_points, n = bound(model, REFERENCE, pixels), len(pixels)
+    seen, depths, of_outline = CAMERA.project(true_points.in_camera(LATER)), None, None
+    beside, places, normals = rim(model, LATER)
+    steps = np.diag([2e-4, 2e-3, 5e-4, 3e-4, 3e-4, 3e-4, 2e-4, 2e-4, 1e-3])
+    for step in steps[[1, 3, 6, 8]]:
+        off = moved(REFERENCE, step)
+        points = bound(model, off, pixels)
+        errors = errors_of(estimator, points, off, np.outer(step, step))
+        frame = measured(points, seen)
+        if other == "depth":
+            depths = PointDepths(true_points.in_camera(LATER)[:, 2], np.full(n, 400.0), 1.0, 1e6)
+            frame = replace(frame, depths=depths)
+        else:
+            joined, every = points.joined(beside), np.ones(n + len(places))
+            no_normals = np.zeros((n, 2))
+            frame = replace(measured(joined, np.vstack([seen, places])), normals=np.vstack([no_normals, normals]))
+            of_outline = estimator.of_pixels(beside, places, every[n:], LATER, normals)[1]
+        found = estimator.fit(frame, LATER)
+        plain = replace(found, covariance=np.zeros((9, 9)), residuals=found.residuals[:n])
+        stated = errors.added(plain, np.ones(n), 0.0, learns=False, depths=depths, of_outline=of_outline)
+        off_by = np.concatenate(
+            [
+                found.state.parameters - LATER.parameters,
+                pose_increment(LATER.camera_from_object, found.state.camera_from_object),
+            ]
+        )
+        within = 0.1 * np.abs(off_by / estimator.scale).max()
+        np.testing.assert_allclose(
+            np.sqrt(np.diag(stated.covariance)) / estimator.scale, np.abs(off_by) / estimator.scale, atol=within
+        )
 
 
 #: Standard deviations of arch, skew, twist, rotation and translation, SI.

@@ -72,8 +72,8 @@ class CommonDepthScale:
         """Take in how an estimate moves (d + 6,) that later ones rest on."""
         self._pushed = pushed
 
-    def push(self, points: BoundPoints, state: State, past: Array, depths: PointDepths | None) -> tuple[Array, Array]:
-        """How one standard deviation of the scale enters a frame's gradient (d + 6,), and the depths' Hessian.
+    def push(self, points: BoundPoints, state: State, past: Array, depths: PointDepths | None) -> Array:
+        """How one standard deviation of the scale enters a frame's gradient (d + 6,).
 
         Parameters
         ----------
@@ -84,6 +84,6 @@ class CommonDepthScale:
         """
         push = past @ self._pushed
         if depths is None or not self._std:
-            return push, np.zeros_like(past)
+            return push
         larger, smaller = (depths.scaled(factor).terms(points, state)[2] for factor in (LARGER, SMALLER))
-        return push - self._std * (larger - smaller) / (2.0 * STEP), depths.terms(points, state)[1]
+        return push - self._std * (larger - smaller) / (2.0 * STEP)

@@ -378,8 +378,15 @@ class FrameEstimation:
 
         ``hessian`` (d + 6, d + 6) is that of all that the estimate was made from, H.
         """
-        part = self._estimator.evaluate(seen.points, seen.pixels, seen.weights, state, seen.normals)[1]
-        return trace_of_share(hessian, part, self._estimator.scale)
+        return trace_of_share(hessian, self._of_outline(seen, state), self._estimator.scale)
+
+    def _of_outline(self, seen: OutlineMeasurement, state: State) -> Array:
+        """The Hessian (d + 6, d + 6) of an outline's own cost."""
+        return self._estimator.of_pixels(seen.points, seen.pixels, seen.weights, state, seen.normals)[1]
+
+    def hessian_of_outline(self, attempt: PoseHypothesis) -> Array | None:
+        """What an outline beside the points adds to the Hessian (d + 6, d + 6) of an attempt; None without one."""
+        return None if attempt.outline is None else self._of_outline(attempt.outline, attempt.estimate.state)
 
     def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Estimate with the depths of the supporting points too, if a depth camera saw them where they are."""

@@ -155,8 +155,8 @@ def _with_systematic_errors(
     # Learned from the images alone, and from residuals that are the object's.
     learns = whole and blurred is None and not len(view.estimation.known.indices)
     found, prior = hypothesis.estimate, hypothesis.prior
-    depths = hypothesis.point_depths
-    estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, depths)
+    others = hypothesis.point_depths, view.estimation.hessian_of_outline(hypothesis)
+    estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, *others)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if blurred is not None:
         warnings.append(BlurredByMotion(path_length(blurred[hypothesis.inliers])))

@@ -6,6 +6,8 @@ model, camera and registration. So the images are asked alone, with all errors t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,8 +50,9 @@ def refuted_values(
         common_px = max(systematic.unexplained(alone, hypothesis.inliers).px, doubt_px)
         weights, prior = hypothesis.weights, hypothesis.prior
         blurred, depths = hypothesis.blurred, hypothesis.point_depths
+        others = depths, estimation.hessian_of_outline(replace(hypothesis, estimate=alone))
         learns = learns and blurred is None
-        alone = systematic.added(alone, weights, common_px, prior, learns, keeps=False, blurred=blurred, depths=depths)
+        alone = systematic.added(alone, weights, common_px, prior, learns, None, False, blurred, *others)
     found, variances = alone.state.parameters[rows], deviations**2 + np.diag(alone.covariance)[rows]
     if errors is not None:
         variances = variances + np.diag(errors.at(alone.state.parameters).parameters)[rows]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.covariance import held_by
-from morph_dslam.tracking.depth import SCALE_STD
+from morph_dslam.tracking.depth import SCALE_STD, PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.linearization import inverse_of_seen
@@ -33,12 +33,16 @@ class _View:
     systematic : errors of the camera's points.
     estimate : in the camera's frame, with the residuals of its texture's points only.
     weights : (p,) of these, zero for those that do not count.
+    depths : (p,) of these, where a depth camera saw them.
+    of_others : (d + 6, d + 6) in the camera's frame, what depths and an outline add to the Hessian.
     """
 
     chain: Array
     systematic: SystematicErrors
     estimate: Estimate
     weights: Array
+    depths: PointDepths | None
+    of_others: Array
 
     @property
     def unexplained(self) -> Unexplained:
@@ -73,6 +77,7 @@ class RigErrors:
             for tracker in trackers
         ]
         self._points = [tracker.reference.points for tracker in trackers]
+        self._estimators = [tracker.estimator for tracker in trackers]
         self._depths = CommonDepthScale(depth_std, self._scale)
         self._by_known = np.zeros((len(self._scale),) * 2)
 
@@ -107,7 +112,7 @@ class RigErrors:
         views = self._views(estimate, measured)
         frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
         both = list(zip(views, frames, strict=True))
-        hessian = np.sum([view.chain.T @ frame.hessian @ view.chain for view, frame in both], axis=0)
+        hessian = np.sum([view.chain.T @ (frame.hessian + view.of_others) @ view.chain for view, frame in both], axis=0)
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         of_known = np.zeros_like(hessian) if known is None else known
@@ -120,24 +125,23 @@ class RigErrors:
             if paths is not None:
                 moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
                 covariance = covariance + moved @ moved.T
-        moved = self._moved_by_depths(hessian, views, measured)
+        moved = self._moved_by_depths(gain, views)
         covariance = covariance + np.outer(moved, moved)
         self._by_known = gain @ of_known
         if self._is_known:
-            pushes = [view.chain.T @ view.systematic.pushed(frame, view.estimate.state) for view, frame in both]
+            pushes = [
+                view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths) for view, frame in both
+            ]
             transfer = gain @ np.sum(pushes, axis=0)
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
-    def _moved_by_depths(self, hessian: Array, views: Sequence[_View], measured: RigObservations) -> Array:
-        """How one standard deviation of the scale of all depths moves the estimate (d + 6,) of points' ``hessian``."""
-        total, push = hessian.copy(), np.zeros(len(hessian))
-        for points, view, seen in zip(self._points, views, measured.views, strict=True):
-            depths = None if seen.depths is None else seen.depths.take(np.arange(len(points)))
-            pushed, of_depths = self._depths.push(points, view.estimate.state, np.zeros_like(hessian), depths)
-            push += view.chain.T @ pushed
-            total += view.chain.T @ of_depths @ view.chain
-        return inverse_of_seen(total, self._scale) @ push if push.any() else push
+    def _moved_by_depths(self, gain: Array, views: Sequence[_View]) -> Array:
+        """How one standard deviation of the scale of all depths moves the estimate (d + 6,)."""
+        push, nothing = np.zeros(len(gain)), np.zeros_like(gain)
+        for points, view in zip(self._points, views, strict=True):
+            push += view.chain.T @ self._depths.push(points, view.estimate.state, nothing, view.depths)
+        return gain @ push
 
     def held(self, measured: NDArray[np.int64]) -> Array:
         """As `SystematicErrors.held`, of the last estimate of all cameras."""
@@ -145,13 +149,24 @@ class RigErrors:
 
     def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
         views, first = [], 0
-        for part, chain, systematic, points, view in zip(
-            self._cameras, self._chains, self._systematic, self._points, measured.views, strict=True
+        for part, chain, systematic, points, estimator, view in zip(
+            self._cameras, self._chains, self._systematic, self._points, self._estimators, measured.views, strict=True
         ):
             count = len(points)
             seen = replace(
                 estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
             )
-            views.append(_View(chain, systematic, seen, view.weights[:count]))
+            texture, outline = np.arange(count), np.arange(count, len(view.weights))
+            depths = None if view.depths is None else view.depths.take(texture)
+            of_others = estimator.of_pixels(
+                view.points.take(outline),
+                view.pixels[outline],
+                view.weights[outline],
+                seen.state,
+                view.normals[outline],
+            )[1]
+            if depths is not None:
+                of_others = of_others + depths.terms(points, seen.state)[1]
+            views.append(_View(chain, systematic, seen, view.weights[:count], depths, of_others))
             first += len(view.weights)
         return views

@@ -4,7 +4,9 @@ The points were bound to the mesh in the reference view, so an error of the obje
 on the surface, and every frame's estimate with them. Let a pixel of the reference view move by J0 e where its
 state is off by e; the material point under a fixed pixel then moves so that its pixel moves by -J0 e, in
 another view by -M J0 e, with M the map between the images of the point's triangle. The frame's estimate takes
-this for motion, H^-1 J' W M J0 e, to first order. In the reference view itself that is e. What it cannot take
+this for motion, H^-1 J' W M J0 e, to first order; H is that of all that it was made from, depths and an
+outline too. The depth of a point that moves on its triangle changes by the edges', and enters alike. Of points
+alone in the reference view itself that is e. What it cannot take
 up stays in the residuals; where they show more of it than the stated covariance of e explains,
 `ReferenceMisfit` says by how much that is too small.
 
@@ -40,6 +42,8 @@ from morph_dslam.tracking.reprojection import project_with_jacobian
 Array = NDArray[np.float64]
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
+#: Derivatives by depths are differences over this share of an error factor.
+STEP = 1e-3
 
 
 def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
@@ -161,6 +165,7 @@ class SystematicErrors:
         keeps: bool = True,
         blurred: Array | None = None,
         depths: PointDepths | None = None,
+        of_outline: Array | None = None,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
 
@@ -176,11 +181,15 @@ class SystematicErrors:
         keeps : whether later frames rest on it
         blurred : (p, 2) pixels, the paths over which motion smears the points; None where it does no harm.
         depths : (p,) of the points, where a depth camera saw them; None without one.
+        of_outline : (d + 6, d + 6) the Hessian of an outline beside the points; None without one.
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
         known = self._estimator.known_information(estimate.state.parameters)[0]
-        hessian = frame.hessian + past + known
+        others = np.zeros_like(past) if of_outline is None else of_outline
+        if depths is not None:
+            others = others + depths.terms(self._points, estimate.state)[1]
+        hessian = frame.hessian + others + past + known
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain = inverse_of_seen(hessian, self._estimator.scale)
@@ -188,12 +197,12 @@ class SystematicErrors:
         stated = estimate.covariance
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
-            by_reference = gain @ (frame.products(moved) + past @ self._by_reference)
+            push = self.pushed(frame, estimate.state, depths) + past @ self._by_reference
+            by_reference = gain @ push
             if self._still and self._factors is not None:
                 # The pose's error moves the points on the surface, and the object with them: both count together.
                 d = len(estimate.state.parameters)
-                by_pose = frame.jacobian[:, :, d:] @ self._factors[d:]
-                by_reference = gain @ (frame.products(moved - by_pose) + past @ self._by_reference)
+                by_reference = gain @ (push - (frame.hessian + others)[:, d:] @ self._factors[d:])
                 by_reference[d:] = self._factors[d:]
             # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
             if learns and not self._still:
@@ -209,10 +218,7 @@ class SystematicErrors:
         if blurred is not None:
             by_blur = self.pushed_by_blur(frame, np.eye(len(gain)), gain, blurred)
             covariance += by_blur @ by_blur.T
-        push, of_depths = self._scale.push(self._points, estimate.state, past, depths)
-        by_scale = gain @ push
-        if of_depths.any():
-            by_scale = inverse_of_seen(hessian + of_depths, self._estimator.scale) @ push
+        by_scale = gain @ self._scale.push(self._points, estimate.state, past, depths)
         covariance += np.outer(by_scale, by_scale)
         if keeps:
             self._by_reference, self._by_model, self._by_known = by_reference, by_model, gain @ known
@@ -250,10 +256,35 @@ class SystematicErrors:
         share = self._common.share_left(frame.usable, both.jacobian, gradients, taken)
         return BeyondReference(float(common), self._common.chance(noise, n_pairs), share, noise)
 
-    def pushed(self, frame: Linearization, state: State) -> Array:
-        """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters a frame's estimate."""
+    def pushed(self, frame: Linearization, state: State, depths: PointDepths | None = None) -> Array:
+        """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters a frame's estimate.
+
+        With ``depths`` (p,) of the points, also how it enters by these.
+        """
         assert self._moved is not None
-        return frame.products(self._warped(state, self._moved))
+        moved = self._warped(state, self._moved)
+        by_pixels = frame.products(moved)
+        return by_pixels if depths is None else by_pixels + self._pushed_by_depths(state, depths, moved)
+
+    def _pushed_by_depths(self, state: State, depths: PointDepths, moved: Array) -> Array:
+        """How the error factors of the reference enter the gradient of depths (d + 6, c), by other places' depths.
+
+        Parameters
+        ----------
+        state : of the frame, to linearise about.
+        depths : (p,) of the points.
+        moved : (p, 2, c) pixels, by which the points move there; zero of those that do not tell.
+        """
+        assert self._moved is not None
+        corners = self._corners.in_camera(state)[:, 2].reshape(-1, 3)
+        by_pixel = np.einsum("pa,pab->pb", corners[:, 1:] - corners[:, :1], self._inverse_edges)
+        tells = np.any(moved, axis=(1, 2), keepdims=True)[:, 0] & np.isfinite(by_pixel)
+        along = np.einsum("pb,pbc->pc", np.where(tells, by_pixel, 0.0), self._moved)
+        at, gradient = depths.depths, depths.terms(self._points, state)[2]
+        push = np.zeros((len(gradient), along.shape[1]))
+        for k, column in enumerate(along.T):
+            push[:, k] = (replace(depths, depths=at - STEP * column).terms(self._points, state)[2] - gradient) / STEP
+        return push
 
     def pushed_by_model(self, frame: Linearization, chain: Array, gain: Array, common_px: float) -> Array:
         """How an estimate from several cameras moves (n, c) by what the model is off in this one.
