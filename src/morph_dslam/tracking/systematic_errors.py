@@ -220,8 +220,9 @@ class SystematicErrors:
             covariance += by_blur @ by_blur.T
         by_scale = gain @ self._scale.push(self._points, estimate.state, past, depths)
         covariance += np.outer(by_scale, by_scale)
+        self._by_known = gain @ known  # of this frame, whether or not later ones rest on it
         if keeps:
-            self._by_reference, self._by_model, self._by_known = by_reference, by_model, gain @ known
+            self._by_reference, self._by_model = by_reference, by_model
             self._scale.keep(by_scale)
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
