@@ -10,7 +10,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Status
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, mean_error
 
 #: The frame after the last of these is compared with a view that this one became.
 FLAT, TURNING = 1.2, np.arange(1.05, 0.1, -0.15)
@@ -43,3 +43,16 @@ def test_no_view_is_made_where_one_is_kept(film):
     for angle in angles:
         result = tracker.track(film.frame(state(angle)))
         assert (result.status, result.view, result.made_view) == (Status.TRACKED, 0, False)
+
+
+@pytest.mark.parametrize("has_picture", [True, False])
+def test_a_view_from_before_a_loss_is_not_gone_over_to_unchecked(film, has_picture):
+    """The sheet is back as the reference shows it, which the view does not."""
+    tracker = turned(film)
+    lost = tracker.track(film.blank()) if has_picture else tracker.pass_over(None)
+    assert lost.status is Status.LOST
+    for _ in range(4):
+        result = tracker.track(film.frame(state(FLAT)))
+        assert result.estimate is not None
+        assert (result.view, result.made_view) == (0, False)
+        assert mean_error(film.model, result.estimate.state, state(FLAT)) < 3e-4

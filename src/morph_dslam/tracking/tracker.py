@@ -579,6 +579,7 @@ class Tracker:
         else:
             self._unfiltered = result.estimate.covariance - hypothesis.estimate.covariance
             if result.recovered:  # what was only just found again is followed for a frame first
+                self._views.after_recovered()
                 return None
             change = self._views.after_tracked(image, hypothesis, result.estimate, result.unexplained_px)
         if change is None:

@@ -389,6 +389,10 @@ class ViewSet:
             self._begun = self._begin(picture, attempt, stated, unexplained_px, now)
         return None
 
+    def after_recovered(self) -> None:
+        """Leave a begun view: it would be gone over to unchecked, and the object may be anywhere since."""
+        self._begun = None
+
     def after_lost(self, n_lost: int) -> Change | None:
         """The view to look for the object with next: that which was followed last and another in turn.
 
