@@ -150,6 +150,30 @@ def test_others_make_good_what_a_sensor_keeps_a_parameter_from(model, certified)
     assert found.covariance == pytest.approx(expected, rel=1e-9)
 
 
+def test_the_shape_errs_by_what_a_sensor_keeps_from_it(model, certified):
+    """The images ask for ``errors``, the estimate moves by what the sensor leaves, and the shape lacks the rest."""
+    stretch, slide = 0.06, 0.004
+    plain, held = tracked_result(model, stretch, slide), np.zeros((8, 2))
+    held[:2, 1] = [-0.4, 0.9]
+    held[7, 1] = 0.2  # and a part of it is taken for a motion along the sight line
+    found = with_model_errors(plain, ModelErrors.of(certified), held)
+
+    def size(mu):
+        return np.sqrt(np.mean(np.sum(displacement(model, mu) ** 2, axis=1)))
+
+    errors = (MEANT - STATES) * (size([stretch, slide]) / np.array([size(meant) for meant in MEANT]))[:, None]
+    lacks = [
+        displacement(model, error) - displacement(model, [error[0] + 0.4 * error[1], 0.1 * error[1]])
+        for error in errors
+    ]
+    lacking = np.sqrt(np.mean(np.sum(np.square(lacks), axis=2), axis=0))
+    assert found.displacement_std() == pytest.approx(np.hypot(plain.displacement_std(), lacking), rel=1e-6)
+    apart = found.image_covariance - plain.covariance
+    along = np.mean((0.2 * errors[:, 1]) ** 2)
+    assert apart[7, 7] == pytest.approx(along, rel=1e-9)
+    assert np.linalg.eigvalsh(apart).min() > -1e-12 * np.trace(apart)
+
+
 def test_where_the_time_is_known_the_other_parameters_alone_make_the_error_good(model):
     """The slide is the time: the stretch that comes nearest to the finer shape is a projection."""
     slide = model.parameters[1]

@@ -174,6 +174,7 @@ class Estimate:
     stated_covariance : the covariance before the residuals widen it, by what they show that model and reference are off
         by; None where they do not.
     by_model : what the model's own errors have added to the covariance; None where they have not.
+    of_shape : (d + 6, d + 6), the covariance of shape and pose where ``by_model`` is not None.
     flat : (d,) variances that come to those of the parameters, but not to those of shape, stress and forces, because a
         parameter changes nothing on one side (`flat_sides`); None where all do.
     """
@@ -189,16 +190,16 @@ class Estimate:
     measured_covariance: Array | None = None
     stated_covariance: Array | None = None
     by_model: ModelDeviation | None = None
+    of_shape: Array | None = None
     flat: Array | None = None
 
     @property
     def image_covariance(self) -> Array:
-        """The covariance (d + 6, d + 6) without what the model's own errors have added: that of shape and pose."""
-        if self.by_model is None:
-            return self.covariance
-        d, covariance = len(self.state.parameters), self.covariance.copy()
-        covariance[:d, :d] -= self.by_model.parameters
-        return covariance
+        """The covariance (d + 6, d + 6) of shape and pose.
+
+        The model's own errors make parameters wrong. Shape and pose they touch where a sensor holds a parameter.
+        """
+        return self.covariance if self.of_shape is None else self.of_shape
 
     @property
     def model_displacement(self) -> float:

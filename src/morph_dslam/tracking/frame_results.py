@@ -179,7 +179,9 @@ def with_model_errors(
     """The result with the errors of the model's mesh and of its reduction in its deviations.
 
     They are the same in frames alike, so that they weigh no frame against another: only results have them. A parameter
-    that a sensor tells makes them good by the images' share in it, and the other unknowns by what it leaves.
+    that a sensor tells makes them good by the images' share in it, and the other unknowns by what it leaves. For a
+    change e of the parameters that the images ask for, the estimate moves by e - ``held`` e: the parameters err by
+    that, shape and pose by the rest, -``held`` e.
 
     Parameters
     ----------
@@ -191,15 +193,16 @@ def with_model_errors(
     estimate = result.estimate
     if errors is None or estimate is None:
         return result
-    mu, covariance = estimate.state.parameters, estimate.covariance.copy()
+    mu = estimate.state.parameters
     d, by_model = len(mu), errors.at(mu)
-    sought = np.diag(covariance)[:d] > 0.0
+    sought = np.diag(estimate.covariance)[:d] > 0.0
     by_model = replace(by_model, parameters=np.outer(sought, sought) * by_model.parameters)
-    made_good = np.eye(d + 6, d) if held is None else np.eye(d + 6, d) - held
-    added = made_good @ by_model.parameters @ made_good.T
-    by_model = replace(by_model, parameters=added[:d, :d])
-    covariance += added
-    return replace(result, estimate=replace(estimate, covariance=covariance, by_model=by_model))
+    held = np.zeros((d + 6, d)) if held is None else held
+    made_good = np.eye(d + 6, d) - held
+    added, of_shape = (part @ by_model.parameters @ part.T for part in (made_good, held))
+    by_model, before = replace(by_model, parameters=added[:d, :d]), estimate.covariance
+    found = replace(estimate, covariance=before + added, by_model=by_model, of_shape=before + of_shape)
+    return replace(result, estimate=found)
 
 
 def with_flat_sides(result: FrameResult, sides: FlatSides) -> FrameResult:

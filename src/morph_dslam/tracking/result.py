@@ -158,7 +158,10 @@ class FrameResult:
 
     @property
     def image_covariance(self) -> Array:
-        """The same without the errors of the model's mesh and reduction, which make parameters wrong, but no shapes."""
+        """The same of shape and pose: errors of mesh and reduction make parameters wrong, but no shapes.
+
+        Where a sensor tells a parameter, it holds a part of them from being made good, and that part is in the shape.
+        """
         return self.covariance if self.estimate is None else self.estimate.image_covariance
 
     @property
