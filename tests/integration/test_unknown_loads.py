@@ -193,6 +193,19 @@ def test_what_is_found_counts_for_the_next_frame_once_scales_are_known(loaded):
     np.testing.assert_array_equal(prior.known.mean, 0.0)
 
 
+def test_a_frame_whose_points_are_too_few_for_a_deviation_teaches_none(loaded):
+    """A prior of infinite weight would end the next frame; the deviation of the frame before holds."""
+    prior = LoadPrior(loaded.energy, LoadOptions())
+    at, few = np.full(26, 0.1), np.full((26, 26), np.inf)
+    prior.learn(at, np.eye(26), 0.3)
+    before = prior.terms(at)
+    prior.learn(at, few, np.inf)
+    cost, information, push = prior.terms(at)
+    assert cost == pytest.approx(before[0], rel=1e-9)
+    assert information == pytest.approx(before[1], rel=1e-9)
+    assert push == pytest.approx(before[2], rel=1e-9)
+
+
 def test_a_stated_work_scale_stays(loaded):
     prior = LoadPrior(loaded.energy, LoadOptions(work=1e-3))
     at = np.array([300.0, *np.full(25, 0.02)])

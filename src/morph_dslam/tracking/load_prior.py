@@ -76,14 +76,18 @@ class LoadPrior:
         return self.squared_px * cost, self.squared_px * self.known.inverse, self.squared_px * push
 
     def learn(self, parameters: Array, covariance: Array, sigma_px: float) -> None:
-        """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels."""
+        """Take in an accepted frame's parameters (n,), their covariance (n, n) and the deviation of its pixels.
+
+        The latter is infinite where the points are too few to tell it: what was known of it goes on then.
+        """
         m, n = self._loads.count, len(parameters)
         loads, own = parameters[-m:], covariance[n - m : n, n - m : n]
         is_determined, is_settled = bool(np.isfinite(covariance).all()), len(self._frames) == MEMORY
         self._covariance = replace(self._covariance, compliance=self._loads.compliance(parameters[:-m]))
         if is_determined and not self._is_stated:
             self._find_scales(np.asarray(np.linalg.inv(own), dtype=np.float64), loads)
-        self.squared_px = sigma_px**2
+        if np.isfinite(sigma_px):
+            self.squared_px = sigma_px**2
         # The first work scale is a guess. Until a better one is found, so are loads that the frames hardly see.
         kept = KEPT if is_determined and is_settled else 0.0
         new = (1.0 - kept**2) * self._covariance.value
