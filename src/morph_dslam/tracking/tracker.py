@@ -291,6 +291,7 @@ class Tracker:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
                 self._lost = True
+                self._forget_loads()
             return image
 
     def _predict(self, camera: CameraLocalization) -> Prior | None:
@@ -418,14 +419,18 @@ class Tracker:
         else:
             self._filter.go_on()
             self.last_measured, self.last_blurred = self.reference.nothing_measured, None
-            if self.estimator.loads is not None:
-                self.estimator.loads.forget()
+            self._forget_loads()
             placed = self._placed_by_map(camera)
             if placed is not None:
                 self._last = replace(self._last, camera_from_object=placed.pose)
             self._history.add(None if placed is None else self._last)
         self._image, self._lost = image, rejection is not None
         self._n_lost = self._n_lost + 1 if self._lost else 0
+
+    def _forget_loads(self) -> None:
+        """Any loads may act by the next frame."""
+        if self.estimator.loads is not None:
+            self.estimator.loads.forget()
 
     # -- results ------------------------------------------------------------------------------------------
 
@@ -505,8 +510,10 @@ class Tracker:
         self._filter.go_on()
         if timestamp is not None:
             self._gaps.after_gap(timestamp)
-        self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
-        self._n_lost += 1
+        if self._views is not None:  # before the first frame nothing is followed that could be lost
+            self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
+            self._n_lost += 1
+            self._forget_loads()
         rejection = Rejection(RejectionReason.NO_PICTURE)
         return FrameResult(self.model, Status.LOST, rejection=rejection, timings_ms=dict.fromkeys(STAGES, 0.0))
 
