@@ -1,5 +1,8 @@
-"""What a registration tells a pose that is one over the sequence."""
+"""What a registration tells a pose that is one over the sequence, and how that is sharpened while frames come."""
 
+from dataclasses import dataclass, replace
+from threading import Event
+from time import sleep
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +11,14 @@ import pytest
 from morph_dslam import TrackerOptions
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.registration.registration import Registration
+from morph_dslam.tracking import still_run
+from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.state import State
-from morph_dslam.tracking.still_run import known_state
+from morph_dslam.tracking.still_run import Sharpening, known_state
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
 
 MODEL = bent_sheet_model(7, 5)
 #: As a registration at rest has it: parameters known, the pose to so much.
@@ -50,3 +57,108 @@ def test_landmarks_count_with_half_a_pixel_at_least(fitted, counted):
         depth=None,
     )
     assert known_state(part).sigma_px == counted  # type: ignore[arg-type]
+
+
+class Sharpened:
+    """Stands for an object with its pose from more frames, which a thread estimates until it is let go.
+
+    Attributes
+    ----------
+    batches : how many frames each estimate is from.
+    goes_on : set to let the thread go.
+    """
+
+    def __init__(self, new_tracker):
+        self.frame, self.object, self.new_tracker = 0, SimpleNamespace(reregister_at=()), new_tracker
+        self.batches, self.goes_on = [], Event()
+
+    def estimated(self, part, keyframes, estimated):
+        self.batches.append(len(keyframes))
+        assert self.goes_on.wait(10.0)
+        return self
+
+
+@pytest.fixture
+def sharpened(monkeypatch):
+    film = SheetFilm(bent_sheet_model(22, 16))
+    state, image = sheet_state(0.1), film.frame(sheet_state(0.1))
+
+    def new_tracker():
+        known = Registration(film.model, state, covariance=np.diag([1e-4] * 9) ** 2)
+        return Tracker(film.model, CAMERA, known, TrackerOptions(pose="still"), reference=image)
+
+    part = Sharpened(new_tracker)
+    monkeypatch.setattr(still_run, "with_still_pose", part.estimated)
+    return part, image
+
+
+def replaced(sharpening, tracker):
+    """The tracker that takes the place of one, once its thread was let go."""
+    for _ in range(1000):
+        new = sharpening.tracker((SimpleNamespace(index=99),), tracker)
+        if new is not tracker:
+            return new
+        sleep(0.01)
+    raise AssertionError("no other tracker came")
+
+
+def test_what_a_sensor_was_said_to_tell_holds_when_the_pose_is_sharpened(sharpened):
+    """The sensor is a millimetre off: the images alone would have the arch elsewhere."""
+    part, image = sharpened
+    told = sheet_state(0.1).parameters[0] + 1e-3
+    sharpening, tracker = Sharpening(part), part.new_tracker()
+    tracker.know({"arch": (told, 1e-5)})
+    for number in range(11):
+        assert sharpening.tracker((SimpleNamespace(index=number),), tracker) is tracker
+        assert tracker.track(image).parameters["arch"] == pytest.approx(told, abs=4e-5)
+    part.goes_on.set()
+    assert replaced(sharpening, tracker).track(image).parameters["arch"] == pytest.approx(told, abs=4e-5)
+
+
+@dataclass(frozen=True)
+class Registered:
+    """Stands for an object that is registered anew in frame 3."""
+
+    model: object = None
+    initializer: object = None
+    reregister_at: tuple = ((3, None),)
+
+    def register(self, cameras, frame, landmarks):
+        return SimpleNamespace(warnings=())
+
+
+def test_what_a_sensor_was_said_to_tell_holds_when_the_object_is_registered_anew(sharpened):
+    part, image = sharpened
+    told = sheet_state(0.1).parameters[0] + 1e-3
+    placed = SimpleNamespace(
+        frame=0, object=Registered(), model=None, cameras=(), in_frames=lambda registration, frames: part
+    )
+    again, tracker = Reregistration(placed), part.new_tracker()
+    tracker.know({"arch": (told, 1e-5)})
+    new = again.tracker((SimpleNamespace(index=3),), tracker)
+    assert new is not tracker
+    assert new.track(image).parameters["arch"] == pytest.approx(told, abs=4e-5)
+
+
+def test_the_pose_is_not_sharpened_by_next_to_no_frames(sharpened):
+    """While an estimate took long, so many frames came that the next is due, but the new tracker has seen none."""
+    part, image = sharpened
+    sharpening, tracker = Sharpening(part), part.new_tracker()
+    result = tracker.track(image)
+    assert result.tracked
+
+    def frames_come(tracker, count):
+        for number in range(count):
+            tracker.last_seen = replace(tracker.last_seen)
+            assert sharpening.tracker((SimpleNamespace(index=number),), tracker) is tracker
+
+    frames_come(tracker, 40)
+    part.goes_on.set()
+    tracker = replaced(sharpening, tracker)
+    assert sharpening.tracker((SimpleNamespace(index=41),), tracker) is tracker
+    assert tracker.track(image).tracked
+    frames_come(tracker, 9)
+    assert part.batches == [10]
+    frames_come(tracker, 1)
+    replaced(sharpening, tracker)
+    assert part.batches == [10, 10]

@@ -108,6 +108,11 @@ class LoadPrior:
         spots = self._displacements[:, variances > 0.0] * np.sqrt(variances[variances > 0.0])
         self._covariance = LoadCovariance(compliance, work, spots)
 
+    def take(self, other: LoadPrior) -> None:
+        """Know what another one does, of the same loads."""
+        self._frames, self._covariance = other._frames, other._covariance
+        self.known, self.squared_px = other.known, other.squared_px
+
     def forget(self) -> None:
         """The next frame is the first, or may follow a gap: loads may be any."""
         m, compliance = self._loads.count, self._loads.compliance(self._energy.model.default)

@@ -57,6 +57,7 @@ class Reregistration:
             return current
         self._notices += [RunNotice.of(RunWarning.REREGISTERED, frame=number), *registration.warnings]
         self._n_lost = 0
+        tracker.estimator.known.take(current.estimator.known)  # what a sensor was said to tell holds on
         return tracker
 
     def _due(self, frame: int) -> list[int]:

@@ -183,10 +183,10 @@ class Sharpening(Reregistration):
             assert isinstance(new, Tracker)
             self._running, self._estimated = None, True
             self._seen, self._every = [], 1
-            new.continue_from(replace(current.state, camera_from_object=new.state.camera_from_object))
-            new.know_jumps(current.jumps)
+            new.take_over(current)
             return new
-        if self._running is None and self._count >= self._due_at:
+        # After an estimate that took long more frames than those may be there, but few of the new tracker.
+        if self._running is None and self._count >= self._due_at and len(self._seen) >= FIRST_TIME:
             self._due_at = 2 * self._count
             self._running = self._executor.submit(self._sharpened, tuple(self._seen))
         return current

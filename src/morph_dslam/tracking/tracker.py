@@ -498,6 +498,15 @@ class Tracker:
         if self._views is not None:
             self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
+    def take_over(self, other: Tracker) -> None:
+        """Go on after the last frame of another tracker of the object, with what that knows but for the pose."""
+        self.continue_from(replace(other.state, camera_from_object=self.state.camera_from_object))
+        self.know_jumps(other.jumps)
+        self.estimator.known.take(other.estimator.known)
+        if self.estimator.loads is not None and other.estimator.loads is not None:
+            self.estimator.loads.take(other.estimator.loads)
+        self._gaps = other._gaps
+
     def pass_over(self, timestamp: float | None) -> FrameResult:
         """Take in that the camera has no picture of an instant; the next frame is as after a loss.
 
