@@ -18,6 +18,7 @@ from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
+from morph_dslam.tracking.multi_camera import agreeing
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
@@ -160,6 +161,23 @@ def test_what_a_sensor_tells_of_a_parameter_counts_once_for_all_cameras():
     step = both.state.parameters - images.state.parameters
     assert (np.abs(step - gain[:3] * own) < 0.1 * images.parameter_std).all()
     assert both.parameter_std[1] == pytest.approx(own / np.sqrt(2.0), rel=0.1)
+
+
+def test_the_depth_of_a_point_that_does_not_agree_does_not_count():
+    """What is before a third of the points, two centimetres nearer, moves them in the image and has its own depth."""
+    rng, points = np.random.default_rng(13), bound(60, 12)
+    before, std = np.arange(60) % 3 == 0, 1e-3
+    seen = seen_by(LEFT, points, rng)
+    depths = points.in_camera(TRUTH)[:, 2] + std * rng.standard_normal(60) - np.where(before, 0.02, 0.0)
+    measured_depths = PointDepths(depths, np.full(60, SIGMA / std), SIGMA**2, 50.0 * SIGMA)
+    seen = replace(seen, pixels=seen.pixels + np.where(before, 30.0, 0.0)[:, None], depths=measured_depths)
+    other = seen_by(ASIDE, bound(60, 14), rng)
+    pixels = [part.camera.project(v.points.in_camera(part.seen(TRUTH))) for part, v in ((LEFT, seen), (ASIDE, other))]
+    kept = agreeing(RigObservations((seen, other)), np.concatenate(pixels) - [*seen.pixels, *other.pixels], 3.0)
+    assert [int((view.weights > 0.0).sum()) for view in kept.views] == [40, 60]
+    found = RigEstimator(MODEL, [LEFT, ASIDE]).fit(kept, TRUTH)
+    off = found.state.camera_from_object.translation - TRUTH.camera_from_object.translation
+    assert (np.abs(off) < 3.0 * found.pose_std[3:]).all()
 
 
 def test_prior_of_the_pose_is_in_the_rigs_frame():

@@ -311,7 +311,8 @@ class RigTracker:
             return None, measured, Rejection(RejectionReason.NO_CAMERA)
         estimate = self.estimator.fit(measured, self.cameras[best].in_rig(seen.state), prior)
         self.estimator.known.learn(estimate.sigma_px)
-        measured = self._agreeing(measured, estimate)
+        limit_px = float(np.clip(self.options.inlier_sigmas * estimate.sigma_px, *self.options.inlier_px))
+        measured = agreeing(measured, estimate.residuals, limit_px)
         needed = self.options.least_inliers if prior is None else self.options.least_anchored
         if (measured.weights > 0.0).sum() < needed:
             return None, measured, Rejection(RejectionReason.CAMERAS_CONTRADICT)
@@ -320,20 +321,28 @@ class RigTracker:
             self._sigma_px = max(estimate.sigma_px, LEAST_SIGMA_PX)
         return self._filter.fuse(measured, estimate, prior), measured, None
 
-    def _agreeing(self, measured: RigObservations, estimate: Estimate) -> RigObservations:
-        """Without points that are far from the estimate, and without cameras of which most are."""
-        limit = np.clip(self.options.inlier_sigmas * estimate.sigma_px, *self.options.inlier_px)
-        with np.errstate(invalid="ignore"):
-            close = np.linalg.norm(estimate.residuals, axis=1) < limit
-        kept, first = [], 0
-        for view in measured.views:
-            weights = np.where(close[first : first + len(view.weights)], view.weights, 0.0)
-            first += len(view.weights)
-            if (weights > 0.0).sum() < LEAST_AGREEING * (view.weights > 0.0).sum():
-                weights = np.zeros_like(weights)
-            depths = view.depths if weights.any() else None
-            kept.append(replace(view, weights=weights, depths=depths))
-        return RigObservations(tuple(kept))
+
+def agreeing(measured: RigObservations, residuals: Array, limit_px: float) -> RigObservations:
+    """What was measured without points that are far from an estimate, and without cameras of which most are.
+
+    Parameters
+    ----------
+    measured : by the cameras.
+    residuals : (p, 2) that the estimate leaves of all points, pixels.
+    limit_px : length from which on a residual is too large.
+    """
+    with np.errstate(invalid="ignore"):
+        close = np.linalg.norm(residuals, axis=1) < limit_px
+    kept, first = [], 0
+    for view in measured.views:
+        weights = np.where(close[first : first + len(view.weights)], view.weights, 0.0)
+        first += len(view.weights)
+        if (weights > 0.0).sum() < LEAST_AGREEING * (view.weights > 0.0).sum():
+            weights = np.zeros_like(weights)
+        # The depth beside such a point is that of whatever is there.
+        depths = None if view.depths is None or not weights.any() else view.depths.only(weights > 0.0)
+        kept.append(replace(view, weights=weights, depths=depths))
+    return RigObservations(tuple(kept))
 
 
 def _ignored(results: list[FrameResult], measured: RigObservations) -> list[CameraIgnored]:
