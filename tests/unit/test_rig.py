@@ -9,16 +9,16 @@ import pytest
 import yaml
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import CameraError
+from morph_dslam.errors import CameraError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.io.camera_files import load_rig
 from morph_dslam.model import SurfacePoints
-from morph_dslam.registration.registration import PosePrior
+from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
-from morph_dslam.tracking.multi_camera import agreeing
+from morph_dslam.tracking.multi_camera import RigTracker, agreeing
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
@@ -213,6 +213,14 @@ def test_single_camera_is_no_rig(tmp_path):
     camchain(tmp_path / "chain.yaml", [])
     with pytest.raises(CameraError, match="is no rig"):
         load_rig(tmp_path / "chain.yaml")
+
+
+def test_unknown_loads_are_refused():
+    """Each camera would count what is known of them once more."""
+    loaded = replace(MODEL, energy=SimpleNamespace(loads=SimpleNamespace(count=1), model=MODEL))
+    pictures = [np.zeros((part.camera.height, part.camera.width), np.uint8) for part in (LEFT, ASIDE)]
+    with pytest.raises(TrackingError, match="one camera"):
+        RigTracker(loaded, (LEFT, ASIDE), Registration(loaded, TRUTH), references=pictures)
 
 
 REFERENCE, ANOTHER, LATER = sheet_state(0.1), sheet_state(0.3), sheet_state(0.6)

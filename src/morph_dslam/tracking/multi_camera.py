@@ -23,7 +23,7 @@ from morph_dslam.tracking.frame_results import with_flat_sides, with_model_error
 from morph_dslam.tracking.frame_starts import new_filter
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.noise import RigObservations
-from morph_dslam.tracking.options import NO_DISCREPANCY, TrackerOptions
+from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, TrackerOptions
 from morph_dslam.tracking.outcomes import (
     BlurredByMotion,
     CameraIgnored,
@@ -86,7 +86,8 @@ class RigTracker:
     RegistrationError
         If the object shows too few corners in a reference frame.
     TrackingError
-        As `Tracker` does, or if the discrepancy is asked for, which is estimated from one camera.
+        As `Tracker` does, or if the discrepancy is asked for, or the model has unknown loads, which both are estimated
+        from one camera.
     ArgumentError
         If model, registration or options are not what `Tracker` takes.
     """
@@ -110,6 +111,8 @@ class RigTracker:
         check_pose(self.options, registration, in_map=anchor is not None or keyframes is not None)
         if self.options.use_discrepancy:
             raise TrackingError(NO_DISCREPANCY)
+        if self.model.n_loads:
+            raise TrackingError(NO_LOADS)
         self.estimator = RigEstimator(self.model, self.cameras, self.options.estimation)
         error_factors = error_factors_of(registration.covariance, self.estimator.scale)
         # What earlier frames add is found from all cameras together.
