@@ -15,6 +15,8 @@ from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.rig import RigCamera
+from morph_dslam.tracking.run_notices import RunWarning, notices_of
+from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, colours, mean_error
 from tests.support.turning_block import turning_block
@@ -170,3 +172,26 @@ def test_several_cameras_need_texture(model):
         RigTracker(
             model, rig, Registration(model, state(0.0)), md.TrackerOptions(use_outline=True), references=[image, image]
         )
+
+
+def test_a_few_corners_are_said_to_be_too_few(ball):
+    """A print of three squares: their corners, which are fewer than the thirty that texture needs."""
+    image = disc(RADIUS_PX)
+    for x, y in ((300, 225), (340, 232), (315, 262)):
+        image[y - 8 : y + 8, x - 8 : x + 8] = 40.0
+    image = colours(image)
+
+    def followed(**options):
+        options = md.TrackerOptions(use_outline=True, **options)
+        result = md.Tracker(ball, CAMERA, Registration(ball, BALL_AT), options, reference=image).track(image)
+        assert result.by_outline
+        run = RunResults(ball, reference_frame=0)
+        run.add(0, 0.0, result)
+        return result.few_corners, [notice.warning for notice in notices_of(run)]
+
+    few, warnings = followed()
+    assert few == (12, 30)
+    assert RunWarning.FEW_CORNERS in warnings
+    few, warnings = followed(use_texture=False)
+    assert few is None
+    assert RunWarning.BY_OUTLINE in warnings

@@ -148,6 +148,18 @@ def test_summary_counts_and_flags():
     assert not turning.at_bound().any()
 
 
+def test_a_run_by_the_outline_alone_says_why():
+    """Asked for, or for want of corners: so many of so many."""
+    sound = frame_result([0.0, 0.0, 0.0], [1e-3, 0.01, 0.01], [False] * 3)
+    for few, reason in (((21, 30), "shows 21 corners in the reference and 30 are needed"), (None, "--no-texture")):
+        run = RunResults(MODEL, reference_frame=0)
+        run.add(0, 0.0, sound)
+        run.add(1, 0.1, replace(sound, by_outline=True, few_corners=few))
+        (notice,) = notices_of(run)
+        assert "outline alone in 1 of 2 frames" in notice.text
+        assert reason in notice.text
+
+
 PER_FRAME = [
     (ObjectMoved(), RunWarning.MOVED),
     (FewPointsAgree(0.5), RunWarning.FEW_AGREE),

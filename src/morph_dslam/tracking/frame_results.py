@@ -128,6 +128,7 @@ def tracked_result(
         estimate,
         warnings=(*warnings, *more),
         by_outline=hypothesis.outline_alone,
+        few_corners=view.reference.few_corners,
         n_points=n_points,
         n_inliers=n_inliers,
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),

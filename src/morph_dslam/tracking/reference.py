@@ -211,6 +211,7 @@ class ReferenceView:
     pixels : (p, 2) where they are in the first view, hidden or not.
     outline : the object's contour, None where it is not used.
     outline_alone : whether the object shows too few corners to count, so that its outline is all there is.
+    few_corners : how many it shows on texture, and how many are needed, where these are too few to count; else None.
     all_points : with those of the outline.
     correlation : of the errors of all points' measurements.
 
@@ -237,6 +238,7 @@ class ReferenceView:
         drawn = self.surface.model
         meshes = [view_of(drawn, camera, view.state, view.discrepancy) for view in views]
         masks, per_pixel = self._draw(meshes)
+        self.few_corners: tuple[int, int] | None = None
         bound = self._bind(meshes, masks, per_pixel)
         self.points = reduce(BoundPoints.joined, bound)
         ends = np.cumsum([len(points) for points in bound])
@@ -400,6 +402,7 @@ class ReferenceView:
         fewest = fewest_points(model)
         needed = max(fewest, self._options.least_inliers)
         if self._options.use_outline and (found < needed or not self._options.use_texture):
+            self.few_corners = (found, needed) if self._options.use_texture else None
             none = SurfacePoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
             return [BoundPoints.from_surface(model, none) for _ in bound]
         if found < fewest:

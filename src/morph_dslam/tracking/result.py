@@ -55,6 +55,8 @@ class FrameResult:
     warnings : what a reader must know of this result.
     pose_from : what the pose comes from.
     by_outline : whether the outline is all that was seen of the object.
+    few_corners : how many corners the object's texture shows in the reference, and how many are needed, where these are
+        too few to follow it by; None where they are enough, or nobody asked for texture.
     pose_prior : the pose by the map, where that alone gives it.
     n_points : number of points that the object itself does not occlude.
     n_inliers : number of those that support the estimate.
@@ -79,6 +81,7 @@ class FrameResult:
     warnings: tuple[TrackingWarning, ...] = ()
     pose_from: PoseSource = PoseSource.NONE
     by_outline: bool = False
+    few_corners: tuple[int, int] | None = None
     pose_prior: PosePrior | None = None
     n_points: int = 0
     n_inliers: int = 0

@@ -49,8 +49,13 @@ class RunWarning(StrEnum):
         "taken it, and its parameters are not known"
     )
     BY_OUTLINE = (
-        "the object was followed by its outline alone in {count} of {n_frames} frames: what moves along the outline, "
-        "or inside of it, is not seen"
+        "the object was followed by its outline alone in {count} of {n_frames} frames, as asked for (--no-texture): "
+        "what moves along the outline, or inside of it, is not seen"
+    )
+    FEW_CORNERS = (
+        "the object was followed by its outline alone in {count} of {n_frames} frames, since its texture shows "
+        "{corners} corners in the reference and {needed} are needed: what moves along the outline, or inside of it, is "
+        "not seen"
     )
     MOVED = (
         "the object has moved from its place in the map in {count} {frames}, first in frame {first}: there its points "
@@ -206,6 +211,17 @@ class RunNotice(Notice):
         return {"kind": self.kind, **self.data, "text": self.text}
 
 
+def _by_outline(run: RunResults) -> list[RunNotice]:
+    """That the outline is all that was seen in some frames, and why."""
+    by_outline = [result for result in run.results if result.by_outline]
+    if not by_outline:
+        return []
+    data = {"count": len(by_outline), "n_frames": len(run)}
+    if (few := by_outline[-1].few_corners) is None:
+        return [RunNotice.of(RunWarning.BY_OUTLINE, **data)]
+    return [RunNotice.of(RunWarning.FEW_CORNERS, **data, corners=few[0], needed=few[1])]
+
+
 def notices_of(run: RunResults) -> list[RunNotice]:
     """What a reader of the results must know."""
     held = _held_at_bound(run)
@@ -215,9 +231,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
         found.append(of(RunWarning.LOST, count=lost, n_frames=n_frames))
     if run.hidden.any():
         found.append(of(RunWarning.HIDDEN, count=int(run.hidden.sum()), n_frames=n_frames))
-    by_outline = sum(result.by_outline for result in run.results)
-    if by_outline:
-        found.append(of(RunWarning.BY_OUTLINE, count=by_outline, n_frames=n_frames))
+    found += _by_outline(run)
     found += _of_frames(run)
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
