@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import morph_dslam as md
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
+from morph_dslam.model.parameter_errors import parameter_errors
 from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.tracking.estimator import State
@@ -195,3 +198,22 @@ def test_a_few_corners_are_said_to_be_too_few(ball):
     few, warnings = followed(use_texture=False)
     assert few is None
     assert RunWarning.BY_OUTLINE in warnings
+
+
+def test_what_a_sensor_tells_is_exact_and_the_shape_errs_by_what_it_keeps_from_it(model):
+    """The object moves by a twentieth more than the model, which the certificate has, and a sensor tells the bend."""
+    mu = np.array([0.01, 0.1])
+    shape = model.displacement.value(mu)
+    entry = parameter_errors(model, [(mu, shape, 1.05 * shape)])
+    too_stiff = replace(model, certificate={"discretisation": {"parameters": entry}})
+    softer = replace(model, displacement=model.displacement.with_modes(1.05 * model.displacement.modes))
+    rng, result, std = np.random.default_rng(4), None, 1e-5
+    tracker = new_tracker(too_stiff, plain(softer, 0.0, rng))
+    for time in (0.08, 0.16, 0.24):
+        tracker.know({"bend": (float(state(time).parameters[0]), std)})
+        result = tracker.track(plain(softer, time, rng))
+        assert result.estimate is not None
+    assert result.parameter_std["bend"] == pytest.approx(std, rel=0.1)
+    found = model.displacement.value(result.estimate.state.parameters)
+    off = np.linalg.norm(found - softer.displacement.value(state(0.24).parameters), axis=1)
+    assert np.sqrt(np.mean(result.displacement_std() ** 2)) == pytest.approx(np.sqrt(np.mean(off**2)), rel=0.3)

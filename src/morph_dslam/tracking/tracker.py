@@ -226,8 +226,7 @@ class Tracker:
                 hypothesis = self._refine(image, hypothesis, camera)
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
-            systematic, measured = self._view.systematic, self.estimator.known.indices
-            held = None if systematic is None or not len(measured) else systematic.held(measured)
+            held = None if result.estimate is None else self._held(hypothesis)
             change = self._choose_view(image, hypothesis, result)
             result = with_model_errors(result, self._errors_now(result.pose_from), held)
             result = with_flat_sides(result, self._flat_sides)
@@ -450,6 +449,15 @@ class Tracker:
             is_still = self.options.pose == "still"
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
         return replace(result, view=number, motion=self._image.motion, modulus_std=self.options.modulus_std)
+
+    def _held(self, hypothesis: PoseHypothesis) -> Array | None:
+        """What sensors keep from an accepted estimate (d + 6, d), see `SystematicErrors.held`; None without any."""
+        measured, systematic = self.estimator.known.indices, self._view.systematic
+        if not len(measured):
+            return None
+        if systematic is None:
+            return self._view.estimation.held_from_outline(hypothesis, self._filter.past_information)
+        return systematic.held(measured)
 
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
         """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
