@@ -303,6 +303,32 @@ def test_reactions_balance_the_loads():
     np.testing.assert_allclose(moment, -np.cross(place, load), atol=1e-7)
 
 
+def test_derivatives_of_reactions_balance_those_of_the_loads():
+    """Of a clamped edge, against a point load that grows at its deformed place: d(x cross f) = dx cross f + x cross df.
+
+    The load is a parameter once, and once comes beside the study's.
+    """
+    shell = solved_shell("""
+        mesh = { generator = "plate", size = ["100 mm", "20 mm"], divisions = [3, 2] }
+        shell = { thickness = "0.5 mm" }
+        material = { young = "1 GPa", poisson = 0.3 }
+        sets = { tip = { nearest = ["100 mm", "20 mm", "0 mm"] } }
+        supports = [{ kind = "clamped", on = "x_min" }]
+        loads = [{ kind = "point", on = "tip", force = ["0 N", "10 mN * a", "30 mN * a"] }]
+        parameters = { a = { range = [0.0, 1.0], default = 1.0 } }
+    """)
+    problem, dofs, mu = shell.problem, shell.state.dofs, shell.state.mu
+    load, place = np.array([0.0, 0.01, 0.03]), np.array([0.1, 0.02, 0.0]) + shell.displacement("tip")
+    tangent, applied = problem.linearise(dofs, mu), problem.residual_slopes(dofs, mu)
+    changes = sensitivities(problem, shell.state, tangent)
+    moved = problem.nodal_displacement(changes[0])[problem.mesh.set_nodes("tip")[0]]
+    given = changes, tangent.apply(changes) + applied, "x_min", np.zeros(3)
+    expected = -load, -np.cross(moved, load) - np.cross(place, load)
+    for found in (problem.reaction_slopes(dofs, mu, *given), problem.response_reactions(dofs, mu, *given)):
+        for slope, balance in zip(found, expected, strict=True):
+            np.testing.assert_allclose(slope[0], balance, atol=1e-4 * np.linalg.norm(balance))
+
+
 @pytest.mark.slow
 def test_a_cloth_hung_by_two_corners():
     """It swings down from level to rest: its weight is on the corners, and its middle hangs below them."""

@@ -22,7 +22,7 @@ from morph_dslam.mechanics.load_modes import LoadedSurface
 from morph_dslam.mechanics.loads import BodyForce, EdgeLoad, Gravity, Load, NodalForces, PointLoad
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
-from morph_dslam.mechanics.shell_energy import AveragedNormals, ShellKinematics, ShellUnknowns, rim_angle
+from morph_dslam.mechanics.shell_energy import AveragedNormals, ShellKinematics, ShellUnknowns, rim_angle, unit
 from morph_dslam.mechanics.shell_material import ShellMaterial, components
 from morph_dslam.mechanics.shell_recovery import ShellRecovery
 from morph_dslam.mechanics.shell_supports import HoldsDirection, SymmetryPlane
@@ -260,9 +260,26 @@ class ShellProblem(SolidProblem):
         self._latest = None
         return super().linearise(x, mu, solver)
 
+    def response_slopes(self, dofs: Array, mu: Array, responses: Array) -> dict[str, Array]:
+        """See `SolidProblem.response_slopes`; displacement and stresses are linear in the dofs."""
+        fields = [self.sample(response, mu) for response in responses]
+        return {name: np.array([field[name] for field in fields]) for name in fields[0]}
+
     def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
         force, moment = super().reactions(dofs, mu, name, about)
         return force, moment + self._edge_couple(dofs, name)
+
+    def reaction_slopes(
+        self, dofs: Array, mu: Array, dof_slopes: Array, force_slopes: Array, name: str, about: Array
+    ) -> tuple[Array, Array]:
+        force, moment = super().reaction_slopes(dofs, mu, dof_slopes, force_slopes, name, about)
+        return force, moment + self._edge_couple_slopes(dofs, dof_slopes, name)
+
+    def response_reactions(
+        self, dofs: Array, mu: Array, responses: Array, forces: Array, name: str, about: Array
+    ) -> tuple[Array, Array]:
+        force, moment = super().response_reactions(dofs, mu, responses, forces, name, about)
+        return force, moment + self._edge_couple_slopes(dofs, responses, name)
 
     def _edge_couple(self, dofs: Array, name: str) -> Array:
         """Moment (3,), N m, by which the supports of a set hold the direction of its edges."""
@@ -271,11 +288,32 @@ class ShellProblem(SolidProblem):
             return np.zeros(3)
         self._state.vec.FV().NumPy()[:] = dofs
         parts = self.unknowns(self._state.components)
-        tangent = ngs.specialcf.tangential(3)
-        across = ngs.Cross(ShellKinematics.reference_normal, tangent)
-        couple = indicator * ((parts.moment * across) * across) * ShellKinematics(parts.displacement).tangent
+        couple = _rim_moment(parts.moment) * ShellKinematics(parts.displacement).tangent
+        return self._on_rims(indicator * couple)
+
+    def _edge_couple_slopes(self, dofs: Array, changes: Array, name: str) -> Array:
+        """Derivatives (c, 3) of `_edge_couple` along changes (c, n) of the dofs, of which alone it is a function."""
+        indicator = self._normals.indicators.get(name)
+        if indicator is None:
+            return np.zeros((len(changes), 3))
+        self._state.vec.FV().NumPy()[:] = dofs
+        change = ngs.GridFunction(self.space)
+        at, along = self.unknowns(self._state.components), self.unknowns(change.components)
+        edge = ngs.specialcf.tangential(3)
+        deformed, moved = ShellKinematics(at.displacement).gradient * edge, ngs.Grad(along.displacement) * edge
+        tangent = unit(deformed)
+        turned = (moved - (tangent * moved) * tangent) / ngs.Norm(deformed)
+        slope = indicator * (_rim_moment(along.moment) * tangent + _rim_moment(at.moment) * turned)
+        result = np.empty((len(changes), 3))
+        for row, values in zip(result, changes, strict=True):
+            change.vec.FV().NumPy()[:] = values
+            row[:] = self._on_rims(slope)
+        return result
+
+    def _on_rims(self, vector: Any) -> Array:
+        """Integral (3,) of a vector over the rims of the elements."""
         rims, mesh = ngs.ds(element_boundary=True), self.geometry.ngs
-        return np.array([ngs.Integrate(couple[axis] * rims, mesh) for axis in range(3)])
+        return np.array([ngs.Integrate(vector[axis] * rims, mesh) for axis in range(3)])
 
     @cached_property
     def recovery(self) -> ShellRecovery:
@@ -285,6 +323,12 @@ class ShellProblem(SolidProblem):
     def strain_energy(self, dofs: Array, mu: Array) -> float:
         self.symbols.set(mu)
         return self.assembly.energy(dofs, 3)
+
+
+def _rim_moment(moment: Any) -> Any:
+    """The part of bending moments (3x3) that bends across the rim of an element."""
+    across = ngs.Cross(ShellKinematics.reference_normal, ngs.specialcf.tangential(3))
+    return (moment * across) * across
 
 
 class _ShellAssembly(Assembly):

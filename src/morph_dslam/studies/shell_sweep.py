@@ -80,8 +80,7 @@ class ShellSweep(SolidSweep):
     def response_fields(self, state: Any, loads: Array, responses: Array) -> dict[str, Array]:
         """See `unknown_loads.LoadableProblem`."""
         forces = self._tangent(state).apply(responses) - loads
-        fields = [self.problem.sample(response, state.mu) for response in responses]
-        slopes = {name: np.array([field[name] for field in fields]) for name in fields[0]}
+        slopes = self.problem.response_slopes(state.dofs, state.mu, responses)
         return slopes | response_reactions(self.problem, state.dofs, state.mu, responses, forces)
 
     def take_snapshot(self, state: Any) -> Snapshot:
