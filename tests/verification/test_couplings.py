@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.contact import RigidPlane
+from morph_dslam.mechanics.contact import RigidPlane, RigidSphere
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.couplings import Coupling, Motion, Rotation as CoupledRotation
 from morph_dslam.mechanics.kinematics import ShapeField
@@ -20,7 +20,7 @@ from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
 from morph_dslam.mechanics.solvers.stability import unstable_directions
-from morph_dslam.mechanics.supports import RigidRotation, fixed
+from morph_dslam.mechanics.supports import PrescribedDisplacement, RigidRotation, fixed
 from morph_dslam.meshing.generators import block, tube
 from tests.support.solids import RUBBER, load_parameter, solved
 
@@ -118,6 +118,47 @@ def test_a_plate_that_is_pushed_against_a_wall_shares_its_force_with_the_solid()
     held, _ = problem.reactions(state.dofs, state.mu, "x_min")
     assert wall < -0.5 * push
     np.testing.assert_allclose(wall + held[0], -push, rtol=1e-6)
+
+
+def pressed_block(held: bool) -> SolidProblem:
+    """A block on whose top, a coupled set or a face that a support moves onto it, a ball presses."""
+    symbols = load_parameter(down=0.08, side=0.13)
+    mesh = block((1.0, 1.0, 1.0), (3, 3, 2), "hex8")
+    down, side = symbols["down"], symbols["side"]
+    centre = (0.63, 0.5, 1.3) if held else (0.5 + side, 0.5, 1.3 - down)
+    moved = [PrescribedDisplacement("z_max", side - 0.13, 0.0, down)] if held else []
+    solid = mesh, {"all": NeoHookean(young=1e5, poisson=0.3)}, [fixed("z_min"), *moved], [], symbols
+    contacts = [RigidSphere("z_max", centre, 0.3)]
+    return (
+        SolidProblem(*solid, contacts=contacts)
+        if held
+        else CoupledSolid([Coupling("z_max")], *solid, contacts=contacts)
+    )
+
+
+def test_derivatives_where_contact_presses_on_a_coupled_set() -> None:
+    """Its pressure, above Young's modulus, turns with the ball's normals: all of that counts at equilibrium."""
+    problem = pressed_block(held=False)
+    state = loaded_state(problem, problem.symbols.default)
+    for slope, change in zip(sensitivities(problem, state), 1e-5 * np.eye(2), strict=True):
+        ends = [solve(problem, state.mu + sign * change, state).dofs for sign in (1.0, -1.0)]
+        expected = (ends[0] - ends[1]) / 2e-5
+        np.testing.assert_allclose(slope, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_derivatives_of_reactions_where_contact_presses_on_a_held_face() -> None:
+    problem = pressed_block(held=True)
+    state = loaded_state(problem, problem.symbols.default)
+    tangent, applied = problem.linearise(state.dofs, state.mu), problem.residual_slopes(state.dofs, state.mu)
+    slopes = sensitivities(problem, state, tangent)
+    given = slopes, tangent.apply(slopes) + applied, "z_max", np.zeros(3)
+    found = problem.reaction_slopes(state.dofs, state.mu, *given)
+    for index, change in enumerate(1e-5 * np.eye(2)):
+        ends = [solve(problem, state.mu + sign * change, state) for sign in (1.0, -1.0)]
+        parts = [problem.reactions(end.dofs, end.mu, "z_max", np.zeros(3)) for end in ends]
+        for slope, ahead, behind in zip(found, *parts, strict=True):
+            expected = (ahead - behind) / 2e-5
+            np.testing.assert_allclose(slope[index], expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_a_turned_problem_has_the_turned_solution() -> None:

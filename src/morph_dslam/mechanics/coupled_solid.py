@@ -142,11 +142,20 @@ class CoupledSolid(SolidProblem):
         solver = solver or self.solver
         self._set(mu)
         placed = self._placed(x)
-        inner = super().linearise(placed, mu, solver)
+        inner, reduced = self._of_solid(x, placed, mu, solver)
         blocks = [part.stiffness(q, forces) for part, q, forces in self._on_sets(x, inner.residual)]
         has_energy = all(part.has_energy for part in self._sets)
         coupled = _Coupled(self._following, self._columns(x), _block_diagonal(blocks), has_energy)
-        return _CoupledLinearisation(inner, self._reduced(inner.residual, placed, x), coupled, solver.all_free)
+        return _CoupledLinearisation(inner, reduced, coupled, solver.all_free)
+
+    def _of_solid(self, x: Array, placed: Array, mu: Array, solver: TangentSolver) -> tuple[Linearisation, Array]:
+        """Linearisation of the solid, its sets ``placed`` where ``x`` has them, and the residual (n_dofs,) at ``x``."""
+        residual = self._known_residual(placed, mu)
+        reduced = self._reduced(residual, placed, x)
+        # Moments count by the forces that they are at the distance of the body's size.
+        on_motions = (self.motions(reduced) / np.repeat([1.0, self.length], 3)).ravel()
+        unbalanced = np.concatenate([residual[solver.free], on_motions[solver.all_free[self.n_unknowns :]]])
+        return self._linearised(placed, mu, residual, solver, unbalanced), reduced
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
         self._set(mu)
@@ -154,7 +163,7 @@ class CoupledSolid(SolidProblem):
         slopes, moved = super().residual_slopes(placed, mu), np.zeros((len(mu), self.n_unknowns))
         moved[:, self._following] = np.hstack([part.displacement_slopes(q) for part, q in self._moved(x)])
         if moved.any():
-            slopes = slopes + super().linearise(placed, mu, self.solver).apply(moved)
+            slopes = slopes + self._of_solid(x, placed, mu, self.solver)[0].apply(moved)
         on_sets = self._on_sets(x, super().residual(placed, mu))
         explicit = np.hstack([part.unbalanced_slopes(q, forces) for part, q, forces in on_sets])
         unbalanced = slopes[:, self._following] @ self._columns(x).T + explicit

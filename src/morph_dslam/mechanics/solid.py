@@ -44,7 +44,7 @@ from morph_dslam.mechanics.viscous_history import ViscousHistory
 from morph_dslam.meshing.meshes import Mesh
 
 Array = NDArray[np.float64]
-#: The tangent of contact is complete where the forces on free dofs are balanced to such a part of those of contact.
+#: The tangent of contact is complete where the forces on what is free are balanced to such a part of those of contact.
 BALANCED = 0.02
 Support = PrescribedMotion | ElasticFoundation
 
@@ -334,20 +334,30 @@ class SolidProblem:
 
     def linearise(self, x: Array, mu: Array, solver: TangentSolver | None = None) -> Linearisation:
         """See `newton.Equations`; ``solver``, in place of the solid's own, holds part of the free dofs too."""
-        # Newton's method has mostly just asked for the residual at the same point.
+        solver = solver or self.solver
+        residual = self._known_residual(x, mu)
+        return self._linearised(x, mu, residual, solver, residual[solver.free])
+
+    def _known_residual(self, x: Array, mu: Array) -> Array:
+        """The residual at ``x``, which Newton's method has mostly just asked for; the parameters are set."""
         known = self._latest
         same = known is not None and np.array_equal(known[0], x) and np.array_equal(known[1], mu)
         residual = known[2] if known is not None and same else self._evaluate(x, mu)
         self._set(mu)
-        solver = solver or self.solver
-        contact = self._contact_tangent(x, residual, solver.free) if self.contact else None
+        return residual
+
+    def _linearised(
+        self, x: Array, mu: Array, residual: Array, solver: TangentSolver, unbalanced: Array
+    ) -> Linearisation:
+        """Tangent at ``x``, whose ``residual`` leaves forces (k,) ``unbalanced`` on what is free to move, N."""
+        contact = self._contact_tangent(x, unbalanced) if self.contact else None
         return self.assembly.linearise(x, mu, residual, solver, contact)
 
-    def _contact_tangent(self, x: Array, residual: Array, free: NDArray[np.bool_]) -> sp.csr_matrix:
+    def _contact_tangent(self, x: Array, unbalanced: Array) -> sp.csr_matrix:
         assert self.contact is not None
         n = 3 * self.displacements.n_scalar
-        forces = self.contact.residual(x[:n])
-        balanced = np.linalg.norm(residual[free]) <= BALANCED * np.linalg.norm(forces[free[:n]])
+        # All forces of contact count, not those on free dofs alone: what they press on may be held or coupled.
+        balanced = np.linalg.norm(unbalanced) <= BALANCED * np.linalg.norm(self.contact.residual(x[:n]))
         return self.contact.tangent(x[:n], limited=not balanced)
 
     def residual_slopes(self, x: Array, mu: Array) -> Array:
