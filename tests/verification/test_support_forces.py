@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from morph_dslam.mechanics.loads import DeadTraction
+from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure
 from morph_dslam.mechanics.solid import SolidProblem
+from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, fixed
 from morph_dslam.meshing.generators import block
 from morph_dslam.studies.study import make_study
@@ -104,6 +107,26 @@ def test_a_shell_on_springs_and_planes_of_symmetry() -> None:
     """)
     forces = [shell.problem.reactions(shell.state.dofs, shell.state.mu, n)[0] for n in ("x_min", "y_min", "all")]
     np.testing.assert_allclose(forces, [[-2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.8]], atol=1e-6)
+
+
+@pytest.mark.parametrize("order", [["left", "right"], ["right", "left"]])
+@pytest.mark.parametrize("cell_type", ["hex20", "tet4"])
+def test_a_pressure_inside_acts_on_the_part_whose_surface_names_the_face(cell_type: str, order: list[str]) -> None:
+    """1 kPa on a section of 0.5 m2 that surfaces name from both sides: 500 N, to the left and to the right."""
+    mesh = block((2.0, 1.0, 0.5), (2, 1, 1), cell_type)
+    faces = mesh.all_faces()
+    corners = mesh.face_nodes(faces, corners_only=True)
+    at_section = np.where(corners < 0, True, np.isclose(mesh.nodes[corners, 0], 1.0)).all(axis=1)
+    middles = np.concatenate([mesh.nodes[part.connectivity].mean(axis=1)[:, 0] for part in mesh.blocks])
+    section = faces[at_section]
+    is_left = middles[section[:, 0]] < 1.0
+    sides = {"left": section[is_left], "right": section[~is_left]}
+    mesh = replace(mesh, surfaces=mesh.surfaces | {name: sides[name] for name in order})
+    for name, push in (("left", -500.0), ("right", 500.0)):
+        problem = SolidProblem(mesh, {"all": RUBBER}, [fixed("x_min"), fixed("x_max")], [FollowerPressure(name, 1e3)])
+        state = loaded_state(problem, np.zeros(0))
+        forces = [problem.reactions(state.dofs, state.mu, end)[0] for end in ("x_min", "x_max")]
+        np.testing.assert_allclose(sum(forces), [-push, 0.0, 0.0], atol=0.5)
 
 
 @pytest.mark.parametrize(

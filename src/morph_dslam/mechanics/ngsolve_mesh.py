@@ -98,11 +98,15 @@ class NgsolveMesh:
         return element_of_cell
 
     def _add_faces(self, target: Any) -> Combinations:
-        """Every outer face, and every named one inside; a face that two surfaces share is added once."""
+        """Every outer face, and every named one inside; a face that two surfaces share is added once.
+
+        A face inside that surfaces name from the cells on its two sides is two, whose normals are opposite.
+        """
         mesh = self.mesh
         faces = np.concatenate([mesh.boundary_faces(), *mesh.surfaces.values()]).astype(np.int64)
         nodes = mesh.face_nodes(faces, corners_only=True)
-        _, first, which = np.unique(np.sort(nodes, axis=1), axis=0, return_index=True, return_inverse=True)
+        seen_from = np.column_stack([np.sort(nodes, axis=1), faces[:, 0]])
+        _, first, which = np.unique(seen_from, axis=0, return_index=True, return_inverse=True)
         which = which.ravel()
         members, position = {}, len(mesh.boundary_faces())
         for name, surface in mesh.surfaces.items():
