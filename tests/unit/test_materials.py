@@ -268,6 +268,16 @@ HGO = {"shear": 0.5, "k1": 1.3, "k2": 0.7, "bulk": 7.0}
             NeoHookean(young=3.0, poisson=0.3, prony=Prony((0.7, 0.4), (1.0, 2.0))),
             "sum below 1 so that some stiffness remains",
         ),
+        (orthotropic(prony=Prony((0.5,), (1.0,), (0.0,))), "orthotropic has no volumetric part that bulk_moduli"),
+        (
+            Hyperfoam(moduli=(0.1,), exponents=(2.0,), poissons=(0.2,), prony=Prony((0.5,), (1.0,), (0.5,))),
+            "hyperfoam has no volumetric part",
+        ),
+        (
+            UserMaterial(function=lambda F: ngs.InnerProduct(F, F) - 2.0 * ngs.log(ngs.Det(F)),
+                prony=Prony((0.5,), (1.0,), (0.0,))),
+            "user_material has no volumetric part",
+        ),
     ],
 )  # fmt: skip
 def test_unstable_constants_are_refused(material, message):

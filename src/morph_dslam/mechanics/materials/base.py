@@ -110,7 +110,8 @@ class Material(ABC):
     def check(self) -> None:
         """Refuse constants that make the undeformed solid unstable; parameters at their present values.
 
-        Raises StudyError if a constant is not finite, or some small strain would lower the energy.
+        Raises StudyError if a constant is not finite, some small strain would lower the energy, or a Prony series has
+        moduli for a part that the law has not.
         """
         for name, constant in self.constants().items():
             if not np.all(np.isfinite(evaluate(constant))):
@@ -120,6 +121,11 @@ class Material(ABC):
         self.check_constants()
         if self.prony is not None:
             self.prony.check()
+            if self.prony.bulk_moduli is not None and self.volumetric_modulus is None:
+                raise StudyError(
+                    f"{self.name} has no volumetric part that bulk_moduli could be of: leave them out of its prony, "
+                    "so that the whole stress relaxes by relative_moduli"
+                )
         stiffness = self.small_strain_stiffness()
         lowest = np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0]
         if not lowest > 0.0:

@@ -30,7 +30,8 @@ class Prony:
     ----------
     relative_moduli : g_i, the parts of the instantaneous stiffness that relax; their sum is below 1.
     times : relaxation times tau_i, s.
-    bulk_moduli : k_i, the same of the volumetric part; None: as g_i, so that the whole law relaxes.
+    bulk_moduli : k_i, the same of the volumetric part, for laws that have one; None: as g_i, so that the whole law
+        relaxes.
     """
 
     relative_moduli: tuple[Constant, ...]
