@@ -42,6 +42,14 @@ rows = 3
 marker_mm = 30
 gap_mm = 9
 """
+RUBBER = 'law = "neo_hookean"\nyoung = "young"\npoisson = 0.3'
+FIBRES = """law = "transversely_isotropic"
+young_fibre = "young"
+young_cross = "1 MPa"
+poisson_fibre = 0.3
+poisson_cross = 0.3
+shear_fibre = "1 MPa"
+"""
 CAMERA = "width: 640\nheight: 480\nfx: 528\nfy: 528\ncx: 319.5\ncy: 239.5\n"
 
 
@@ -282,6 +290,16 @@ def message_of_study(folder, *changes):
         ),
         (('["push", "0 Pa", "pull"]', '["push", "0 Pa", "-1 * pul"]'), "load 1: '-1 * pul' names 'pul', which is no"),
         (("poisson = 0.3", "poisson = 0.5"), "materials.rubber: neo_hookean: "),
+        (("poisson = 0.3", "poisson = [0.3]"), "materials.rubber: neo_hookean: poisson = [0.3] is not a number"),
+        (
+            ("poisson = 0.3", 'poisson = 0.3\ndensity = ["1 g/cm3"]'),
+            "materials.rubber: neo_hookean: density = [1000.0] is not a number",
+        ),
+        ((RUBBER, FIBRES + 'fibre = ["a", 0, 0]'), "materials.rubber: the direction ['a', 0, 0] must be three numbers"),
+        (
+            (RUBBER, FIBRES + 'fibre = { angle = "9 deg", from = [1, {}, 0], towards = [0, 1, 0] }'),
+            "materials.rubber: the direction [1, {}, 0] must be three numbers",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_study_is_said_in_its_own_words(tmp_path, change, expected):

@@ -29,11 +29,20 @@ from morph_dslam.mechanics.materials.isotropic import Rubber, first_invariant
 Direction = Any
 
 
+def _numbers(direction: Direction) -> Array:
+    """A direction, or one for each cell, that is no coefficient function, as an array; StudyError if it cannot be."""
+    try:
+        return np.asarray(direction, dtype=float)
+    except (TypeError, ValueError) as error:
+        given = list(direction) if isinstance(direction, tuple) else direction
+        raise StudyError(f"the direction {given} must be three numbers, not all of them zero") from error
+
+
 def unit_direction(direction: Direction, law: str) -> Any:
     """The direction as a unit vector coefficient function; StudyError if it is zero or no vector."""
     if isinstance(direction, ngs.CoefficientFunction):
         return direction / ngs.Norm(direction)
-    vector = np.asarray(direction, dtype=float)
+    vector = _numbers(direction)
     if vector.shape != (3,) or not np.linalg.norm(vector) > 0.0 or not np.all(np.isfinite(vector)):
         raise StudyError(f"{law}: the direction {direction} must be three numbers, not all of them zero")
     return ngs.CF(tuple(vector / np.linalg.norm(vector)))
@@ -44,13 +53,17 @@ def turned_direction(angle: Constant, start: tuple[float, ...], towards: tuple[f
 
     Raises StudyError if the two directions are zero or parallel.
     """
-    a, b = np.asarray(start, dtype=float), np.asarray(towards, dtype=float)
+    a, b = _numbers(start), _numbers(towards)
     if a.shape != (3,) or b.shape != (3,) or not np.linalg.norm(np.cross(a, b)) > 1e-9 * (a @ a + b @ b):
         raise StudyError(f"a fibre angle turns from {start} towards {towards}: two directions that differ")
     a = a / np.linalg.norm(a)
     b = b - (a @ b) * a
     b = b / np.linalg.norm(b)
     return ngs.cos(ngs.CF(angle)) * ngs.CF(tuple(a)) + ngs.sin(ngs.CF(angle)) * ngs.CF(tuple(b))
+
+
+def _is_by_cell(direction: Direction) -> bool:
+    return not isinstance(direction, ngs.CoefficientFunction) and _numbers(direction).ndim == 2
 
 
 class Directed(Material):
@@ -63,14 +76,14 @@ class Directed(Material):
         return {name: getattr(self, name) for name in self.directions if getattr(self, name) is not None}
 
     def on_mesh(self, cell_field: Callable[[Array], Any]) -> Self:
-        by_cell = {name: np.asarray(d, dtype=float) for name, d in self._given().items() if np.ndim(d) == 2}
+        by_cell = {name: _numbers(d) for name, d in self._given().items() if _is_by_cell(d)}
         for name, values in by_cell.items():
             if not np.all(np.linalg.norm(values, axis=1) > 0.0):
                 raise StudyError(f"{self.name}: the {name} of a cell is zero")
         return replace(self, **{name: cell_field(values) for name, values in by_cell.items()})
 
     def at_a_point(self) -> Self:
-        fields = [n for n, d in self._given().items() if isinstance(d, ngs.CoefficientFunction) or np.ndim(d) == 2]
+        fields = [n for n, d in self._given().items() if isinstance(d, ngs.CoefficientFunction) or _is_by_cell(d)]
         return replace(self, **{name: self.directions[name] for name in fields})
 
     def check_constants(self) -> None:

@@ -91,8 +91,13 @@ def _value(law: type[Material], key: str, value: Any, annotation: str) -> Any:
         return _direction(value)
     if annotation.startswith("tuple"):
         return _sequence(value, key)
-    if isinstance(value, (str, list, dict, bool)):
-        raise StudyError(f"{law.law}: {key} = {value} is not a number")
+    return _number(law, key, value)
+
+
+def _number(law: type[Material], key: str, value: Any) -> Any:
+    if isinstance(value, (str, list, tuple, dict, bool)):
+        given = list(value) if isinstance(value, tuple) else value
+        raise StudyError(f"{law.law}: {key} = {given} is not a number")
     return value
 
 
@@ -131,7 +136,7 @@ def _user_material(table: dict[str, Any], folder: Path) -> UserMaterial:
         function = load_function(function, folder)
     if not callable(function):
         raise StudyError('user_material lacks its function, given as "file.py:name"')
-    own = {key: table.pop(key) for key in ("density", "bulk", "prony") if key in table}
-    if "prony" in own:
-        own["prony"] = _prony(own["prony"])
+    own = {key: _number(UserMaterial, key, table.pop(key)) for key in ("density", "bulk") if key in table}
+    if "prony" in table:
+        own["prony"] = _prony(table.pop("prony"))
     return UserMaterial(function=function, values=table, **own)
