@@ -257,3 +257,14 @@ def test_constants_that_no_material_has_anywhere_in_the_box_are_refused(tmp_path
     with pytest.raises(StudyError, match=r"materials\.rubber: ") as caught:
         load_study(write_study(tmp_path, change))
     assert message in str(caught.value)
+
+
+def test_poissons_ratio_that_reaches_zero_is_refused_in_mixed_elements_before_anything_is_solved(tmp_path):
+    changes = [
+        ("poisson = 0.3", 'poisson = "nu"'),
+        ("[solver]", '[parameters.nu]\nrange = [0.0, 0.4]\ndefault = 0.3\n[solver]\nformulation = "mixed"'),
+    ]
+    with pytest.raises(StudyError, match=r"mixed elements cannot take neo_hookean where .*nu = 0: .* range of nu"):
+        load_study(write_study(tmp_path, *changes)).sweep_problem()
+    changes[1] = (changes[1][0], changes[1][1].replace("0.0, 0.4", "0.1, 0.4"))
+    assert load_study(write_study(tmp_path, *changes)).sweep_problem()

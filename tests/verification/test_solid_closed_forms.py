@@ -24,11 +24,13 @@ from tests.support.solids import FACES, ROLLERS, RUBBER, AffineSupport, distorte
 STIFF = NeoHookean(young=2.8e6, poisson=0.4)
 #: Hooke's law in the Green-Lagrange strain: l_2^2 = 1 - nu (l^2 - 1) and P = l E (l^2 - 1) / 2.
 HOOKE = StVenantKirchhoff(young=3e6, poisson=0.3)
+#: Without Poisson's effect P = E (l - 1 / l) / 2.
+CORK = NeoHookean(young=3e6, poisson=0.0)
 
 
 @pytest.mark.parametrize(
     ("material", "lateral", "stress"),
-    [(RUBBER, 0.830679, 1.075843e6), (STIFF, 0.846028, 1.022825e6), (HOOKE, 0.625**0.5, 2.8125e6)],
+    [(RUBBER, 0.830679, 1.075843e6), (STIFF, 0.846028, 1.022825e6), (HOOKE, 0.625**0.5, 2.8125e6), (CORK, 1.0, 1.25e6)],
 )
 @pytest.mark.parametrize(("cell_type", "mixed"), [("hex8", False), ("hex20", True), ("tet10", False)])
 def test_uniaxial_stretch(material: Material, lateral: float, stress: float, cell_type: str, mixed: bool) -> None:

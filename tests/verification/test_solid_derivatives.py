@@ -25,7 +25,7 @@ from morph_dslam.mechanics.materials.isotropic import Hyperfoam, NeoHookean, Ogd
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.rigid_mesh import RigidMesh
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
-from morph_dslam.mechanics.solvers.continuation import advance
+from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
 from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, RigidRotation, fixed
@@ -232,6 +232,16 @@ def test_pressures_do_not_count_as_instability() -> None:
         linearisation = problem.linearise(np.zeros(problem.n_dofs), np.zeros(0))
         # Without PARDISO so many negative pivots cannot be counted.
         assert linearisation.negative_pivots in ((0,) if default_engine() == "pardiso" else (0, None))
+
+
+@pytest.mark.parametrize("cell_type", ["tet10", "hex20"])
+def test_a_block_that_widens_as_it_is_pulled_is_stable_in_mixed_elements(cell_type: str) -> None:
+    """Of a negative Poisson's ratio; Lame's lambda is negative, and pressures would count as so many minima less."""
+    mesh = block((1.0, 1.0, 1.0), (1, 1, 1), cell_type)
+    loads = [DeadTraction("z_max", (0.0, 0.0, 1e4))]
+    law = NeoHookean(young=1e6, poisson=-0.2)
+    problem = SolidProblem(mesh, {"all": law}, [fixed("z_min")], loads, options=SolidOptions(mixed=True))
+    assert loaded_state(problem, np.zeros(0)).negative_pivots == 0
 
 
 def test_follower_pressure_makes_the_tangent_unsymmetric() -> None:

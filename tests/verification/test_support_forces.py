@@ -152,3 +152,45 @@ def test_kept_solutions_whose_forces_were_given_otherwise_are_solved_anew(
     now = make_study(content).fingerprint()
     monkeypatch.setattr("morph_dslam.studies.solid_study.support_content", lambda supports, mesh: {})
     assert (make_study(content).fingerprint() != now) is changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "anew"),
+    [
+        ({}, False),
+        ({"couplings": [{"on": "x_max"}]}, True),
+        ({"supports": [{"kind": "fixed", "on": "x_min"}, {"kind": "displacement", "on": "x_max", "x": "0 mm"}]}, False),
+        (
+            {
+                "supports": [
+                    {"kind": "fixed", "on": "x_min"},
+                    {"kind": "rotation", "on": "x_max", "axis": [1, 0, 0], "angle": "9 deg"},
+                ]
+            },
+            True,
+        ),
+        ({"solver": {"formulation": "mixed"}}, False),
+        (
+            {
+                "solver": {"formulation": "mixed"},
+                "materials": {"m": {"law": "neo_hookean", "young": "1 MPa", "poisson": -0.1}},
+            },
+            True,
+        ),
+    ],
+)
+def test_kept_solutions_with_wrong_derivatives_are_solved_anew(
+    changes: dict, anew: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = {
+        "name": "block",
+        "mesh": {"generator": "block", "size": ["20 mm", "10 mm", "10 mm"], "divisions": [2, 1, 1], "cells": "hex8"},
+        "materials": {"m": {"law": "neo_hookean", "young": "1 MPa", "poisson": 0.3}},
+        "supports": [{"kind": "fixed", "on": "x_min"}],
+        "contacts": [{"kind": "plane", "on": "x_max", "point": ["21 mm", "0 mm", "0 mm"], "normal": [-1, 0, 0]}],
+        "parameters": {"pull": {"range": ["0 kPa", "1 kPa"]}},
+        "loads": [{"kind": "pressure", "on": "z_max", "pressure": "pull"}],
+    }
+    now = make_study(content | changes).fingerprint()
+    monkeypatch.setattr("morph_dslam.studies.solid_study.mended_content", lambda study, mesh: {})
+    assert (make_study(content | changes).fingerprint() != now) is anew

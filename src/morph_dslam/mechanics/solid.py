@@ -57,10 +57,11 @@ class SolidOptions:
     ----------
     order : of the displacements, 1 to 3; None for 2, save on meshes of hex8 cells alone, which have elements of first
         order that do not lock. Order 2 on first-order cells adds functions on their edges, faces and inside.
-    mixed : give every material with a volumetric part pressures of its own, against locking near
-        incompressibility; see `PressureSpace`. hex20 and prism15 then use all functions of second order. None gives
-        meshes of hex8 cells alone enhanced strains (see `enhanced_strain`); of the materials on other meshes, those
-        take the mixed form that need it, where the cells have one. False is plain displacement elements.
+    mixed : give every material pressures of its own whose energy has a volumetric part with a modulus that is positive
+        at the parameters' defaults, against locking near incompressibility; see `PressureSpace`. hex20 and prism15
+        then use all functions of second order. None gives meshes of hex8 cells alone enhanced strains (see
+        `enhanced_strain`); of the materials on other meshes, those take the mixed form that need it, where the cells
+        have one. False is plain displacement elements.
     serendipity : leave out functions that second-order cells with nodes on their edges alone have not, where no
         material is mixed; see `DisplacementSpace`.
     at_nodes : evaluate stresses and strains at the nodes themselves, as elements of third order do, in place of where
@@ -127,7 +128,8 @@ class SolidProblem:
         order = default_order(mesh) if options.order is None else options.order
         enhanced = options.mixed is None and takes_enhanced_strain(mesh, order)
         mixed = set() if enhanced else mixed_materials(self.geometry, order, materials, options.mixed)
-        self.displacements = DisplacementSpace(self.geometry, order, bool(mixed), options.serendipity)
+        full = bool(mixed or options.mixed)
+        self.displacements = DisplacementSpace(self.geometry, order, full, options.serendipity)
         self.shape = Shape(self.displacements, shape)
         self.length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         self.cell_materials = owners_of_cells(mesh, materials)

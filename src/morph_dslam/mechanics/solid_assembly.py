@@ -182,4 +182,5 @@ class _MixedLinearisation(AssembledLinearisation):
     @property
     def negative_pivots(self) -> int | None:
         found = super().negative_pivots
-        return None if found is None else found - self._multipliers
+        # Fewer than there are multipliers mean that the pressures' block is not negative, and tell nothing.
+        return None if found is None or found < self._multipliers else found - self._multipliers

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.materials.base import Material, green_lagrange
+from morph_dslam.mechanics.materials.base import Material, evaluate, green_lagrange
 from morph_dslam.mechanics.ngsolve_mesh import NgsolveMesh
 from morph_dslam.mechanics.spaces import DisplacementSpace, PressureSpace, check_mixed, has_mixed_form
 from morph_dslam.meshing.meshes import Mesh
@@ -113,6 +113,16 @@ def can_be_mixed(material: Material) -> bool:
     return material.volumetric_modulus is not None and not relaxes
 
 
+def has_pressure(material: Material) -> bool:
+    """Whether the mixed form has a solution for a material: its energy has a volumetric part whose modulus is positive.
+
+    It is the pressure over this modulus that the form contains; Lame's lambda is none where Poisson's ratio is 0, and
+    negative below, where nothing locks.
+    """
+    modulus = material.volumetric_modulus
+    return modulus is not None and evaluate(modulus) > 0.0
+
+
 def mixed_materials(
     geometry: NgsolveMesh, order: int, materials: Mapping[str, Material], mixed: bool | None
 ) -> set[str]:
@@ -120,11 +130,11 @@ def mixed_materials(
 
     Raises StudyError if a material is unstable.
     """
-    if mixed is not None:
-        return set(materials) if mixed else set()
-    if not has_mixed_form(geometry.mesh, order):
+    if mixed is False or (mixed is None and not has_mixed_form(geometry.mesh, order)):
         return set()
     placed = {name: _placed(geometry, name, material) for name, material in materials.items()}
+    if mixed:
+        return {name for name, law in placed.items() if has_pressure(law)}
     soft = [name for name, law in placed.items() if law.equivalent_poisson >= NEARLY_INCOMPRESSIBLE]
     return {name for name in soft if can_be_mixed(placed[name])}
 
@@ -143,7 +153,7 @@ def place_materials(
     Parameters
     ----------
     owners : of `owners_of_cells`.
-    mixed : cell sets whose materials use the mixed form, if they have a volumetric part.
+    mixed : cell sets whose materials use the mixed form: `mixed_materials`.
     enhanced : whether the cells have enhanced strains, which no material makes lock.
     """
     regions = space.geometry.partition(owners)
@@ -170,7 +180,7 @@ def _material_region(
     material, mesh = _placed(space.geometry, name, material), space.geometry.mesh
     if enhanced:
         return MaterialRegion(material, region)
-    if mixed and material.volumetric_modulus is not None:
+    if mixed:
         check_mixed(mesh, space.order)
         unit = material.small_strain_stiffness()[3, 3] / float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         return MaterialRegion(material, region, PressureSpace(space, region), unit)

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.contact import RigidObstacle
 from morph_dslam.mechanics.coupled_solid import CoupledSolid
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
+from morph_dslam.mechanics.solid_materials import has_pressure
 from morph_dslam.mechanics.supports import held_still
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
@@ -28,6 +30,7 @@ from morph_dslam.studies.body_study import (
     check_effect,
     check_names,
     numbered,
+    range_ends,
     read_once,
     reader_of,
     support_content,
@@ -92,6 +95,22 @@ class _SolidSolverSection(WorkSection):
     workers: int | None = Field(default=1, ge=1)
     order: Literal[1, 2] | None = None
     formulation: Literal["automatic", "displacement", "mixed"] = "automatic"
+
+
+def _check_pressures(problem: SolidProblem) -> None:
+    """Raise StudyError if a material that has pressures would not have them at an end of a parameter's range."""
+    symbols = problem.symbols
+    for material in (region.material for region in problem.regions if region.pressures):
+        for blamed, mu in range_ends(symbols.parameters, list(range(len(symbols))), combined=False):
+            symbols.set(mu)
+            if not has_pressure(material):
+                name = symbols.parameters[blamed[0]].name
+                raise StudyError(
+                    f"mixed elements cannot take {material.name} where {symbols.text(mu)}: its volumetric modulus, "
+                    f"Lame's lambda, must be positive there: change the range of {name}, "
+                    'or set solver.formulation = "displacement"'
+                )
+    symbols.set(symbols.default)
 
 
 class SolidStudy(BodyStudy, Section):
@@ -295,7 +314,7 @@ class SolidStudy(BodyStudy, Section):
         mesh = self.solid_mesh()
         content["mesh"] = mesh_fingerprint(self._solved(mesh))
         content["code"] = SOLVER_VERSION
-        content |= support_content(self.supports, mesh)
+        content |= support_content(self.supports, mesh) | mended_content(self, mesh)
         content |= {"shape": shape_fingerprints(self.shape, mesh)} if self.shape else {}
         content |= self.model_dump(mode="json", include={"couplings"}) if self.couplings else {}
         content |= self.model_dump(mode="json", include={"contacts"}) if self.contacts else {}
@@ -357,6 +376,7 @@ class SolidStudy(BodyStudy, Section):
         supports, loads, couplings = made(self.supports), made(self.loads), made(self.couplings)
         problem = solid(*([part for part, _ in parts] for parts in (supports, loads, couplings)))
         check_effect(problem.constraints, [part for part, _ in supports])
+        _check_pressures(problem)
         if self._applied_first():
             problem.applied_first = partial(
                 solid,
@@ -406,3 +426,25 @@ class SolidStudy(BodyStudy, Section):
         mesh = self.solid_mesh()
         held = [part.on for part in (*self.supports, *(part for part in self.couplings if part.held))]
         return replace(model_mesh_of(mesh), supports={name: mesh.set_nodes(name) for name in held})
+
+
+def mended_content(study: SolidStudy, mesh: Mesh) -> dict[str, str]:
+    """What a fingerprint says where earlier versions solved otherwise, or kept wrong derivatives.
+
+    They counted contact on coupled sets and on held faces in part, let a pressure on a face inside act either way,
+    and gave pressures to materials whose volumetric modulus is negative.
+    """
+    mended: dict[str, str] = {}
+    nothing = np.zeros((mesh.n_nodes, 3), dtype=bool)
+    held = np.any([nothing, *study.held_components().values()], axis=0) if study.contacts else nothing
+    if study.contacts and (study.couplings or any(held[mesh.set_nodes(part.on)].all() for part in study.contacts)):
+        mended["contact"] = "counted wherever it acts"
+    pressed = [load.on for load in study.loads if load.kind == "pressure"]
+    outer = set(map(tuple, mesh.boundary_faces().tolist())) if pressed else set()
+    if any(not outer.issuperset(map(tuple, mesh.surface(name).tolist())) for name in pressed):
+        mended["faces inside"] = "on their own side"
+    if study.solver.formulation == "mixed":
+        laws = [section.make(reader_of(study._symbols())) for section in study.materials.values()]
+        if any(law.volumetric_modulus is not None and not has_pressure(law) for law in laws):
+            mended["pressures"] = "where positive"
+    return mended
