@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.errors import SolverError, StudyError
+from morph_dslam.errors import ArgumentError, SolverError, StudyError
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.materials.viscoelastic import Prony
 from morph_dslam.mechanics.solid import SolidProblem
@@ -121,5 +121,7 @@ def test_derivatives_by_the_constants_of_a_series_at_a_fixed_history(cell_type: 
         ends = [problem.residual(state.dofs, mu + sign * steps[k]) for sign in (1.0, -1.0)]
         np.testing.assert_allclose(slopes[k], (ends[0] - ends[1]) / 2e-5, atol=1e-8)
         assert np.abs(slopes[k]).max() > 1e-3
+    with pytest.raises(ArgumentError, match="they depend on its history"):
+        problem.sample_slopes(state.dofs, state.mu, slopes)
     with pytest.raises(StudyError, match="a Prony series changes along a path"):
         advance(problem, state, mu)

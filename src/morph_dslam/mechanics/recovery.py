@@ -20,6 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from morph_dslam.errors import ArgumentError
 from morph_dslam.mechanics.enhanced_assembly import EnhancedAssembly
 from morph_dslam.mechanics.kinematics import Kinematics
 from morph_dslam.mechanics.materials.base import VOIGT
@@ -207,7 +208,14 @@ class Recovery:
         ----------
         dof_slopes : (d, n_dofs) derivatives of the solution, `newton.sensitivities`.
         by_parameters : whether they are those by the parameters, on which constants and shape may depend too.
+
+        Raises
+        ------
+        ArgumentError
+            If the solid is viscous: its stress depends on how it came there too.
         """
+        if self._problem.history:
+            raise ArgumentError("a viscous solid has no derivatives of its fields: they depend on its history")
         points, average = self._node_rule()
         result = {"displacement": np.array([self._problem.nodal_displacement(s) for s in dof_slopes])}
         indices = range(len(dof_slopes)) if by_parameters else [None] * len(dof_slopes)
@@ -250,10 +258,7 @@ class Recovery:
             if explicit is not None:
                 dF = dF + self._by_region([explicit] * len(self._laws), points)
             for name in names:
-                total = _derived_change(name, F, P, dF, dP)
-                if self._problem.history and name in STRESSES:
-                    total += self._overstress_slope(name, F, dF, points)
-                result[name].append(_components(name, total))
+                result[name].append(_components(name, _derived_change(name, F, P, dF, dP)))
         return result
 
     def _stress_changes(self, index: int | None, points: NDArray) -> Array:
@@ -267,13 +272,6 @@ class Recovery:
         if index is not None and any(index in law.by_parameters for law in self._laws):
             result += self._by_region([law.by_parameters.get(index, zero) for law in self._laws], points)
         return result
-
-    def _overstress_slope(self, name: str, F: Array, dF: Array, points: NDArray) -> Array:
-        """Derivative (p, 3, 3) of the remembered stress's part along a change of F."""
-        history = self._problem.history
-        assert history is not None
-        H, step = history.remembered_at(points), 1e-6
-        return (_overstress(name, F + step * dF, H) - _overstress(name, F - step * dF, H)) / (2.0 * step)
 
     def _by_region(self, expressions: list[Any], points: NDArray, shape: tuple[int, int] = (3, 3)) -> Array:
         """Values (p, *shape) of one expression for each region at mesh points."""

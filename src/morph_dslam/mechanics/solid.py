@@ -437,7 +437,8 @@ class SolidProblem:
     def sample_slopes(self, dofs: Array, mu: Array, dof_slopes: Array) -> dict[str, Array]:
         """Total derivatives (d, n, c) of displacement, strain and stress at the nodes by the parameters.
 
-        ``dof_slopes`` (d, n_dofs) are those of the solution: `newton.sensitivities`.
+        ``dof_slopes`` (d, n_dofs) are those of the solution: `newton.sensitivities`. Raises ArgumentError if the solid
+        is viscous.
         """
         return self.recovery.slopes_at_nodes(dofs, mu, dof_slopes)
 
