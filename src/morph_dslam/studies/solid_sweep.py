@@ -207,8 +207,7 @@ class SolidSweep:
 
     def __init__(self, problem: SolidProblem) -> None:
         self.problem = problem
-        self._kept: tuple[Array, Linearisation] | None = None
-        self._solved: Array | None = None
+        self._kept: tuple[State, Linearisation] | None = None
         self._farthest: dict[tuple[bytes, bytes], Array] = {}
 
     def first_state(self) -> _SolidState:
@@ -223,10 +222,9 @@ class SolidSweep:
     def unpack(self, arrays: dict[str, Array]) -> _SolidState:
         pivots = int(arrays["pivots"])
         state = _SolidState(arrays["mu"], arrays["dofs"], arrays["slopes"], None if pivots < 0 else pivots)
-        if self._solved is None or not np.array_equal(self._solved, state.dofs):
+        if self._tangent_at(state) is None:
             self._kept = None  # its memory is needed for the next one
-            self._kept = state.mu, self.problem.linearise(state.dofs, state.mu)
-            self._solved = state.dofs
+            self._kept = State(state.mu, state.dofs), self.problem.linearise(state.dofs, state.mu)
         return state
 
     def advance(self, start: _SolidState, target: Array) -> _SolidState:
@@ -235,7 +233,7 @@ class SolidSweep:
         If the tangent at ``start`` is still at hand it serves first.
         """
         predicted = start.dofs + (target - start.mu) @ start.slopes
-        tangent, self._kept = self._tangent_at(start.mu), None
+        tangent, self._kept = self._tangent_at(start), None
         try:
             refuse_large_turn(self.problem, start.mu, target)
             state = solve_with_kept_tangent(self.problem, target, predicted, tangent)
@@ -270,15 +268,18 @@ class SolidSweep:
             self._farthest[key] = farthest_solved(self.problem, start, target)
         return self._farthest[key]
 
-    def _tangent_at(self, mu: Array) -> Linearisation | None:
-        """The tangent of a solution if it is still at hand."""
-        return self._kept[1] if self._kept is not None and np.array_equal(self._kept[0], mu) else None
+    def _tangent_at(self, state: _SolidState) -> Linearisation | None:
+        """The tangent of a solution if it is still at hand; there may be others at the same parameters."""
+        if self._kept is None:
+            return None
+        at, tangent = self._kept
+        return tangent if np.array_equal(at.mu, state.mu) and np.array_equal(at.dofs, state.dofs) else None
 
     def _with_slopes(self, state: State) -> _SolidState:
-        self._kept = self._solved = None
+        self._kept = None
         tangent = self.problem.linearise(state.dofs, state.mu)
         slopes = sensitivities(self.problem, state, tangent)
-        self._kept, self._solved = (state.mu, tangent), state.dofs
+        self._kept = State(state.mu, state.dofs), tangent
         return _SolidState(state.mu, state.dofs, slopes, unstable_directions(self.problem, tangent))
 
     def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
@@ -314,7 +315,7 @@ class SolidSweep:
         return (at[0] - 2.0 * at[1] + at[2]) / step**2
 
     def _tangent(self, state: _SolidState) -> Linearisation:
-        return self._tangent_at(state.mu) or self.problem.linearise(state.dofs, state.mu)
+        return self._tangent_at(state) or self.problem.linearise(state.dofs, state.mu)
 
     def take_snapshot(self, state: _SolidState) -> Snapshot:
         """Fields at the nodes, their slopes, reactions, and the tangent's negative pivots."""
