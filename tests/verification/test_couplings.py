@@ -328,6 +328,24 @@ def test_couplings_share_no_nodes_and_hold_no_body() -> None:
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("turned", [0.3, 0.999, 1.001, 6.0, 22.0, 28.0, 60.0])
+def test_a_rotation_and_its_derivatives_at_any_number_of_turns(turned: float) -> None:
+    """Against SciPy's matrices, and central differences of these; a spin about the axis is one of the angle."""
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    found, changes = CoupledRotation.of(turned * axis), 1e-4 * np.eye(3)
+
+    def exact(change: Array) -> Array:
+        return Rotation.from_rotvec(turned * axis + change).as_matrix()
+
+    np.testing.assert_allclose(found.matrix, exact(np.zeros(3)), atol=1e-13)
+    np.testing.assert_allclose(axis @ found.spins, axis, atol=1e-12)
+    for slope, curvatures, a in zip(found.slopes, found.curvatures, changes, strict=True):
+        np.testing.assert_allclose(slope, (exact(a) - exact(-a)) / 2e-4, atol=1e-8)
+        for curvature, b in zip(curvatures, changes, strict=True):
+            mixed = exact(a + b) - exact(a - b) - exact(b - a) + exact(-a - b)
+            np.testing.assert_allclose(curvature, mixed / 4e-8, atol=1e-6)
+
+
 def test_an_iteration_that_winds_a_set_up_gets_no_numbers_and_no_warnings():
     for far in (1e3, 1e80, np.inf):
         assert np.isnan(CoupledRotation.of(np.array([0.0, far, 1.0])).matrix).all()

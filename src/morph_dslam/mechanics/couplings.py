@@ -34,9 +34,11 @@ MOTIONS = 6
 _NAMES: tuple[Motion, ...] = get_args(Motion)
 #: Matrices (3, 3, 3) of the cross product with each unit vector from the left.
 _CROSS: Array = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)
-#: a and b as power series in |t|^2; so many terms are exact beyond a full turn.
-_A, _B = (Polynomial([(-1.0) ** k / factorial(2 * k + first) for k in range(30)]) for first in (1, 2))
-#: Components of a rotation vector, rad, up to which powers of it are within the range of numbers.
+#: a and b as power series in |t|^2, which so many terms give exactly where it is below `SMALL`.
+_A, _B = (Polynomial([(-1.0) ** k / factorial(2 * k + first) for k in range(12)]) for first in (1, 2))
+#: Square of an angle up to which the series are summed: digits of the closed forms cancel there.
+SMALL = 1.0
+#: Components of a rotation vector, rad, beyond which an iteration has wound up, and no turn is meant.
 MOST_TURNED = 100.0
 #: A set whose extent across its longest direction is a smaller part of that lies on a line.
 LINE = 1e-6
@@ -67,6 +69,19 @@ class Coupling:
         return Coupling(self.on, point=self.point, held=self.held)
 
 
+def _factors(square: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """The factors a and b of a rotation with that square of its angle, each with its two derivatives by the square."""
+    if square < SMALL:
+        a, b = ((f(square), f.deriv(1)(square), f.deriv(2)(square)) for f in (_A, _B))
+        return a, b
+    angle = np.sqrt(square)
+    cosine, a = np.cos(angle), np.sin(angle) / angle
+    b = (1.0 - cosine) / square
+    a_slope, b_slope = (cosine - a) / (2.0 * square), (0.5 * a - b) / square
+    a_bend, b_bend = -(0.5 * a + 3.0 * a_slope) / (2.0 * square), (0.5 * a_slope - 2.0 * b_slope) / square
+    return (a, a_slope, a_bend), (b, b_slope, b_bend)
+
+
 @dataclass(frozen=True)
 class Rotation:
     """A rotation matrix and its derivatives by the rotation vector.
@@ -84,7 +99,7 @@ class Rotation:
 
     @staticmethod
     def of(vector: Array) -> Rotation:
-        """Of a rotation vector (3,), rad; not a number where an iteration has turned it too far for the series."""
+        """Of a rotation vector (3,), rad; not a number where an iteration has turned it by more than `MOST_TURNED`."""
         if not np.abs(vector).max() < MOST_TURNED:
             vector = np.full(3, np.nan)
         square = float(vector @ vector)
@@ -93,8 +108,8 @@ class Rotation:
         products = _CROSS[:, None] @ _CROSS
         squares = K @ K, _CROSS @ K + K @ _CROSS, products + products.swapaxes(0, 1)
         matrix, slopes, curvatures = np.eye(3), np.zeros((3, 3, 3)), np.zeros((3, 3, 3, 3))
-        for series, (M, dM, ddM) in ((_A, (K, K_slopes, K_curvatures)), (_B, squares)):
-            value, first, second = series(square), series.deriv(1)(square), series.deriv(2)(square)
+        factors = _factors(square)
+        for (value, first, second), (M, dM, ddM) in zip(factors, ((K, K_slopes, K_curvatures), squares), strict=True):
             d, dd = 2.0 * first * vector, 4.0 * second * np.outer(vector, vector) + 2.0 * first * np.eye(3)
             cross = np.multiply.outer(d, dM)
             matrix = matrix + value * M
