@@ -42,6 +42,7 @@ rows = 3
 marker_mm = 30
 gap_mm = 9
 """
+IDLE = '[[supports]]\nkind = "displacement"\non = "z_max"\n'
 RUBBER = 'law = "neo_hookean"\nyoung = "young"\npoisson = 0.3'
 FIBRES = """law = "transversely_isotropic"
 young_fibre = "young"
@@ -263,6 +264,10 @@ def message_of_study(folder, *changes):
         (('on = "z_min"', "on = [3]"), "support 1: on: [3] must be a text in quotes"),
         (('on = "z_min"', 'on = "z_min"\nonn = 3'), "support 1: unknown key onn; known here: kind, on"),
         (('on = "z_min"\n', ""), "support 1: on is missing"),
+        (
+            ("[[loads]]", IDLE + "[[loads]]"),
+            "support 2: the displacement of 'z_max' holds nothing: give at least one of",
+        ),
         (("[[supports]]", "[supports]"), "supports must be a list, not a table: write [[supports]]"),
         (("divisions = [1, 1, 3]", "divisions = [1, 1]"), "mesh.divisions, entry 3 is missing"),
         (("[1, 1, 3]", "[1, 1, 3, 5]"), "mesh.divisions has 4 entries, and must have at most 3"),

@@ -91,6 +91,10 @@ def test_an_unstable_material_is_refused_by_its_set() -> None:
         ([], "move along x, y, z and to turn about x, y, z"),
         ([PrescribedDisplacement("z_min", z=0.0)], "move along x, y and to turn about z"),
         ([ElasticFoundation("x_min", 1e6, normal_only=True)], "move along y, z and to turn about x"),
+        (
+            [PrescribedDisplacement("z_min", z=0.0), ElasticFoundation("x_min", 0.0)],
+            "move along x, y and to turn about z: .*whose stiffness is positive",
+        ),
     ],
 )
 def test_missing_supports_are_described(supports: list, words: str) -> None:

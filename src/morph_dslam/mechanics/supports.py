@@ -183,7 +183,9 @@ class Constraints:
         """
         modes = self.rigid_modes()
         rows = [modes[self.held.reshape(3, -1)], others]
-        for foundation in self._foundations:
+        # Where springs vanish they hold nothing; the first solution is that of the parameters' defaults.
+        springs = [foundation for foundation in self._foundations if evaluate(foundation.stiffness) > 0.0]
+        for foundation in springs:
             nodes = self._mesh.surface_nodes(foundation.on)
             at_nodes = np.stack([self._space.node_values[nodes] @ mode for mode in modes], axis=1)
             if foundation.normal_only:
@@ -196,8 +198,11 @@ class Constraints:
         _, sizes, vectors = np.linalg.svd(held[:, :looked_at].T @ held[:, :looked_at])
         free = np.pad(vectors[sizes < FREE_MOTION**2 * max(len(held), 1)], ((0, 0), (0, 6 - looked_at)))
         if len(free):
+            vanishing = (
+                "" if springs == self._foundations else " whose stiffness is positive at the parameters' defaults"
+            )
             raise StudyError(
-                f"the supports leave the body free to {_describe(free)}: fix a set, or give it a foundation"
+                f"the supports leave the body free to {_describe(free)}: fix a set, or give it a foundation{vanishing}"
             )
 
     def rigid_modes(self) -> Array:
@@ -264,7 +269,7 @@ class PrescribedMotion(Protocol):
 class PrescribedDisplacement:
     """Holds the given components of the displacement of a set; a component that is None stays free.
 
-    A symmetry plane or a roller holds the component normal to it at zero.
+    A symmetry plane or a roller holds the component normal to it at zero. Raises StudyError if all are free.
 
     Attributes
     ----------
@@ -279,6 +284,10 @@ class PrescribedDisplacement:
     y: Scalar | None = None
     z: Scalar | None = None
     centred_on = None
+
+    def __post_init__(self) -> None:
+        if not any(self.components):
+            raise StudyError(f"the displacement of '{self.on}' holds nothing: give at least one of x, y and z")
 
     @property
     def components(self) -> tuple[bool, bool, bool]:
