@@ -73,6 +73,11 @@ def test_a_study_of_a_surface_with_a_branch_ends_with_one_message(tmp_path, caps
         ({"material": {"young_fibre": "1 GPa", "young_cross": "1 GPa", "shear": "1 GPa", "poisson": 1.2}}, "unstable"),
         ({"material": {"young": "0 Pa", "poisson": 0.2}}, "must be positive"),
         ({"material": {"young": "1 GPa", "poisson": 0.3, "fibre": [0, 0, 0]}}, "no direction"),
+        (
+            {"material": {"young": "1 GPa", "poisson": 0.3, "density": "-1 g/cm3"}},
+            "density = -1000 must not be negative",
+        ),
+        ({"supports": [{"kind": "clamped", "on": "x_min"}, {"kind": "displacement", "on": "x_max"}]}, "holds nothing"),
         ({"loads": [{"kind": "gravity"}]}, "gravity needs the material's density"),
         ({"loads": [{"kind": "edge", "on": "x_max", "force": ["1 N", "0 N/m", "0 N/m"]}]}, "not a unit of force per"),
         ({"sets": {"tip": {}}}, "either nearest, or a region"),

@@ -47,7 +47,7 @@ class ShellMaterial:
     fibre_angle: Scalar = 0.0
 
     def check(self) -> None:
-        """Refuse constants that are unstable at the parameters' present values (StudyError)."""
+        """Refuse constants that are unstable, or a negative density, at the parameters' present values (StudyError)."""
         names = ("young_fibre", "young_cross", "shear")
         values = {name: evaluate(getattr(self, name)) for name in (*names, "poisson")}
         for name in names:
@@ -58,6 +58,8 @@ class ShellMaterial:
                 f"poisson = {values['poisson']:g} is unstable for these moduli: "
                 "poisson^2 * young_cross / young_fibre must be below 1"
             )
+        if self.density is not None and not (value := evaluate(self.density)) >= 0.0:
+            raise StudyError(f"density = {value:g} must not be negative")
         if not np.linalg.norm(self.fibre) > 0.0:
             raise StudyError(f"the fibre {tuple(self.fibre)} has no direction")
 
