@@ -26,6 +26,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from morph_dslam.errors import SolverError
 from morph_dslam.mechanics.contact_assembly import added
 from morph_dslam.mechanics.enhanced_strain import (
     ADDED,
@@ -334,12 +335,15 @@ class EnhancedAssembly:
                         volume, bulk = law.at("volume", points, 3, 3) / law.shear, law.at("bulk", points)
                         scaled = bulk[:, :, None, None] * volume
                         moduli += volume[:, :, :, :, None, None] * scaled[:, :, None, None]
-                small, follow[some], inner[some], found = condensed_matrices(
-                    moduli,
-                    stress,
-                    (state.nodal[some], state.added[some], state.bulk[some]),
-                    (cells.added[some], cells.bulk[some], cells.centre[some], cells.volumes[some]),
-                )
+                try:
+                    small, follow[some], inner[some], found = condensed_matrices(
+                        moduli,
+                        stress,
+                        (state.nodal[some], state.added[some], state.bulk[some]),
+                        (cells.added[some], cells.bulk[some], cells.centre[some], cells.volumes[some]),
+                    )
+                except (np.linalg.LinAlgError, ZeroDivisionError) as error:
+                    raise SolverError("the tangent of a cell is singular") from error
                 add_to_csr(small, positions[some], starts[some], data)
                 negative += found
         self._add_others(x, data)
