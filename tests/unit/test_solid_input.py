@@ -7,15 +7,17 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import ngsolve as ngs
 import numpy as np
 import pytest
 
-from morph_dslam.errors import StudyError
+from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.contact import RigidPlane
 from morph_dslam.mechanics.kinematics import ShapeField
 from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, MovingPatch, PointLoad
 from morph_dslam.mechanics.materials.anisotropic import Orthotropic
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
+from morph_dslam.mechanics.materials.user import UserMaterial
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solid_materials import NearlyIncompressibleWarning
@@ -114,6 +116,51 @@ def test_an_obstacle_that_overlaps_at_rest_is_refused() -> None:
         replace(above, normal=(0.0, 0.0, 0.0))
     with pytest.raises(StudyError, match="no surface 'lid'"):
         SolidProblem(MESH, {"all": RUBBER}, [fixed("x_min")], contacts=[replace(above, on="lid")])
+
+
+@pytest.mark.parametrize(("depth", "refused"), [("2 mm * wave", False), ("1 mm", True)])
+def test_an_obstacle_that_overlaps_at_first_may_be_moved_by_an_amplitude_alone(depth: str, refused: bool) -> None:
+    """Whose derivative by the time is zero at the defaults: 1 mm deep there, and deeper later on."""
+    wave = {"times": ["0 s", "1 s", "5 s"], "values": [0.5, 0.5, 1.0]}
+    content = {
+        "name": "block",
+        "mesh": {"generator": "block", "size": ["20 mm", "20 mm", "20 mm"], "divisions": [2, 2, 2], "cells": "hex8"},
+        "materials": {
+            "m": {
+                "law": "neo_hookean",
+                "young": "1 MPa",
+                "poisson": 0.3,
+                "prony": {"relative_moduli": [0.5], "times": ["1 s"]},
+            }
+        },
+        "supports": [{"kind": "fixed", "on": "z_min"}],
+        "contacts": [
+            {"kind": "sphere", "on": "z_max", "centre": ["10 mm", "10 mm", f"30 mm - {depth}"], "radius": "10 mm"}
+        ],
+        "parameters": {"t": {"range": ["0 s", "5 s"], "default": "0 s"}},
+        "time": {"parameter": "t", "step": "0.5 s", "amplitudes": {"wave": wave}},
+    }
+    if refused:
+        content["loads"] = [{"kind": "pressure", "on": "x_max", "pressure": "1 kPa * wave"}]
+        with pytest.raises(StudyError, match="the sphere reaches 1 mm into the undeformed surface 'z_max'"):
+            make_study(content).sweep_problem()
+    else:
+        assert make_study(content).sweep_problem()
+
+
+def test_a_cell_without_stiffness_is_a_failed_solve() -> None:
+    """A law whose energy ends at twice the volume, in cells with enhanced strains."""
+
+    def energy(F: ngs.CF) -> ngs.CF:
+        volume = ngs.Det(F)
+        sound = 0.5 * ngs.InnerProduct(F, F) - ngs.log(volume) + 0.5 * (volume - 1.0) ** 2
+        return ngs.IfPos(2.0 - volume, sound, 0.0)
+
+    problem = SolidProblem(MESH, {"all": UserMaterial(function=energy)}, [fixed("x_min")])
+    grown = np.zeros(problem.n_dofs)
+    grown[: 3 * problem.displacements.n_scalar] = problem.displacements.coordinates.T.ravel()
+    with pytest.raises(SolverError, match="tangent of a cell is singular"):
+        problem.linearise(grown, np.zeros(0))
 
 
 def test_an_elastic_foundation_is_support_enough() -> None:

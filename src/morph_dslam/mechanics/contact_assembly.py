@@ -158,8 +158,8 @@ class _Entered:
 class ContactAssembly:
     """All contacts of a solid.
 
-    Raises StudyError if an obstacle that no parameter moves overlaps the undeformed solid, or the core of another lies
-    inside of it at the parameters' defaults.
+    Raises StudyError if an obstacle that no parameter or amplitude moves overlaps the undeformed solid, or the core of
+    another lies inside of it at the parameters' defaults.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ class ContactAssembly:
         self._check_outside()
         for contact, parts in zip(self._contacts, self._found(np.zeros(3 * self._n), 1.0), strict=True):
             rigid = not isinstance(contact, SurfaceContact)
-            if rigid and any(s.any() for s in contact.slopes(self._symbols)):
+            if rigid and self._moves(contact):
                 continue
             allowed = TOUCHING * self._side(contact.on).surface.widths.mean() + (contact.tolerance if rigid else 0.0)
             entered = min(parts, key=lambda part: part.gap.min(initial=0.0))
@@ -240,6 +240,16 @@ class ContactAssembly:
                     f"the {contact.name} reaches {1e3 * depth:.3g} mm into the undeformed surface '{contact.on}', "
                     f"deepest at ({where}) mm: {self._advice(contact)}"
                 )
+
+    def _moves(self, contact: RigidObstacle) -> bool:
+        """Whether an obstacle is elsewhere at other parameters; an amplitude alone, too, may move it."""
+        places, present = self._mesh.nodes[self._mesh.set_nodes(contact.on)], self._symbols.present
+        gaps = []
+        for mu in (present, *self._symbols.telling_states()):
+            self._symbols.set(mu)
+            gaps.append(contact.touch(self._symbols, places).gap)
+        self._symbols.set(present)
+        return any((gap != gaps[0]).any() for gap in gaps[1:])
 
     def _check_outside(self) -> None:
         """Refuse obstacles that no contact could push out of the undeformed solid."""
