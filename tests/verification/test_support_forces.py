@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure
-from morph_dslam.mechanics.solid import SolidProblem
+from morph_dslam.mechanics.loads import DeadTraction, FollowerPressure, SurfaceForce
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.supports import ElasticFoundation, PrescribedDisplacement, fixed
-from morph_dslam.meshing.generators import block
+from morph_dslam.meshing.generators import block, tube
 from morph_dslam.studies.study import make_study
 from tests.support.shells import solved_shell
 from tests.support.solids import ROLLERS, RUBBER, distorted, load_parameter, solved
@@ -107,6 +107,19 @@ def test_a_shell_on_springs_and_planes_of_symmetry() -> None:
     """)
     forces = [shell.problem.reactions(shell.state.dofs, shell.state.mu, n)[0] for n in ("x_min", "y_min", "all")]
     np.testing.assert_allclose(forces, [[-2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.8]], atol=1e-6)
+
+
+@pytest.mark.parametrize(("cell_type", "order"), [("tet10", 2), ("hex20", 2), ("hex20", 3)])
+def test_a_force_on_a_curved_surface_of_few_cells_is_all_there(cell_type: str, order: int) -> None:
+    force = np.array([1.0, 2.0, 3.0])
+    mesh = tube(0.01, 0.02, 0.02, (1, 1, 6), cell_type)
+    loads = [SurfaceForce("inner", tuple(force))]
+    problem = SolidProblem(mesh, {"all": RUBBER}, [fixed("outer")], loads, options=SolidOptions(order=order))
+    unloaded, mu = np.zeros(problem.n_dofs), np.zeros(0)
+    response = problem.linearise(unloaded, mu).solve(-problem.residual(unloaded, mu))
+    change = problem.linearise(unloaded, mu).apply(response) + problem.residual(unloaded, mu)
+    held, _ = problem.response_reactions(unloaded, mu, response[None], change[None], "outer", np.zeros(3))
+    np.testing.assert_allclose(held[0], -force, rtol=1e-9)
 
 
 @pytest.mark.parametrize("order", [["left", "right"], ["right", "left"]])

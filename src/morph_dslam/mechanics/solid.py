@@ -269,7 +269,9 @@ class SolidProblem:
             work = load.virtual_work(kinematics, test)
             return [Term(work, boundary, load.bonus_order, has_energy=False)]
         if isinstance(load, SurfaceForce):
-            area = ngs.Integrate(ngs.CF(1.0) * ngs.ds(definedon=boundary), self.geometry.ngs)
+            # By the quadrature of the load, or a curved surface would have a little more or less than the force.
+            order = 2 * self.displacements.order + load.bonus_order
+            area = ngs.Integrate(ngs.CF(1.0), self.geometry.ngs, ngs.BND, order=order, definedon=boundary)
             return [Term(load.energy(kinematics, area), boundary, load.bonus_order)]
         return [Term(load.energy(kinematics), boundary, load.bonus_order)]
 
