@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from morph_dslam.errors import ArgumentError, SolverError, StudyError
+from morph_dslam.mechanics.contact import RigidPlane
+from morph_dslam.mechanics.loads import DeadTraction
 from morph_dslam.mechanics.materials.isotropic import NeoHookean
 from morph_dslam.mechanics.materials.viscoelastic import Prony
 from morph_dslam.mechanics.solid import SolidProblem
@@ -105,6 +109,28 @@ def test_relaxation(cell_type: str) -> None:
 def test_a_viscous_material_needs_a_time() -> None:
     with pytest.raises(StudyError, match="which parameter is the time"):
         SolidProblem(block((1.0, 1.0, 1.0), (1, 1, 1), "hex8"), {"all": LAW}, [fixed("x_min")])
+
+
+@pytest.mark.parametrize("remembered", [None, 3.0, -20.0])
+def test_contact_with_a_viscous_solid_is_as_stiff_as_with_one_that_has_no_time_to_relax(
+    remembered: float | None,
+) -> None:
+    """Walls confine a block; whether it remembers an earlier or a later time when the penalty is first needed."""
+    symbols, load = load_parameter(time=0.0), DeadTraction("z_max", (0.0, 0.0, -1e4))
+    walls = [
+        RigidPlane("x_max", (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+        RigidPlane("y_max", (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)),
+    ]
+    mesh, elastic = block((1.0, 1.0, 1.0), (2, 2, 2), "hex8"), NeoHookean(young=1e6, poisson=0.499)
+    viscous = replace(elastic, prony=Prony((0.6,), (2.0,), (0.0,)))
+    alike = SolidProblem(mesh, {"all": elastic}, ROLLERS, [load], contacts=walls)
+    problem = SolidProblem(mesh, {"all": viscous}, ROLLERS, [load], symbols, time=symbols["time"], contacts=walls)
+    assert problem.history is not None
+    if remembered is not None:
+        problem.history.restore(np.append(np.zeros(len(problem.history.values()) - 1), remembered))
+    kept = problem.history.values()
+    assert problem.in_contact == pytest.approx(alike.in_contact, rel=1e-9)
+    np.testing.assert_array_equal(problem.history.values(), kept)
 
 
 @pytest.mark.parametrize("cell_type", ["hex8", "tet10"])

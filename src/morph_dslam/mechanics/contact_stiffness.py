@@ -10,6 +10,7 @@ solid.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +27,14 @@ ALLOWED = 0.01
 
 
 def stiffening(problem: SolidProblem) -> float:
-    """Factor, at least 1, with which the penalty has the share `ALLOWED`, in each of the responses on its own."""
-    present = problem.symbols.present
+    """Factor, at least 1, with which the penalty has the share `ALLOWED`, in each of the responses on its own.
+
+    A viscous solid is as stiff as at once, whatever it remembers when this is asked.
+    """
+    present, history = problem.symbols.present, problem.history
     try:
-        shares = closed_shares(problem)
+        with history.at_rest(problem.symbols.default) if history else nullcontext():
+            shares = closed_shares(problem)
     finally:
         problem.symbols.set(present)
     return float(np.max(shares / np.maximum(1.0 - shares, 1e-9), initial=0.0) * (1.0 - ALLOWED) / ALLOWED)

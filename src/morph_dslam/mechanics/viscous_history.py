@@ -16,6 +16,7 @@ The Q_i belong to the g_i and tau_i that they were made with: a path along which
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -154,6 +155,18 @@ class ViscousHistory:
             field.vec.FV().NumPy()[:] = part
         self._accepted.Set(float(values[-1]))
         self._remembers = None
+
+    @contextmanager
+    def at_rest(self, mu: Array) -> Iterator[None]:
+        """Remember, for a while, a body that has rested for ever until the parameters ``mu`` (d,), which are set."""
+        remembered, series = self.values(), self._remembers
+        self._symbols.set(mu)
+        self.restore(np.append(np.zeros(len(remembered) - 1), self._symbols.value(self._time)))
+        try:
+            yield
+        finally:
+            self.restore(remembered)
+            self._remembers = series
 
     def remembered_at(self, points: NDArray) -> Array:
         """Stress left from earlier steps at NGSolve's mesh points: second Piola-Kirchhoff (p, 3, 3), Pa.
