@@ -281,9 +281,34 @@ class Camera:
         return self.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
 
     def maps_of(self, rays: Array) -> Maps:
-        """Maps that take each pixel from where the camera records its ray (h * w, 3)."""
-        pixels = self.project_recorded(rays).astype(np.float32).reshape(self.height, self.width, 2)
-        return cv2.convertMaps(pixels, None, cv2.CV_16SC2)  # type: ignore[call-overload]
+        """Maps that take each pixel from where the camera records its ray (h * w, 3), to 1/32 px.
+
+        For interpolation only: the nearest pixel that OpenCV takes by them is mostly another one.
+        """
+        return cv2.convertMaps(self._seen_at(rays), None, cv2.CV_16SC2)  # type: ignore[call-overload]
+
+    def _seen_at(self, rays: Array) -> NDArray[np.float32]:
+        """Where the camera records the ray (h * w, 3) of each pixel, (h, w, 2)."""
+        return self.project_recorded(rays).astype(np.float32).reshape(self.height, self.width, 2)
+
+    @cached_property
+    def _undistorted_from(self) -> NDArray[np.float32]:
+        """Where the recorded image shows each pixel (h, w, 2) of the undistorted one."""
+        return self._seen_at(self.pixel_rays)
+
+    def undistort_unblended(self, values: NDArray, outside: float) -> NDArray:
+        """What the undistorted image has of values (h, w) that must not be blended, such as depths.
+
+        Parameters
+        ----------
+        values : in the image as recorded; of each pixel, those of the nearest recorded one count.
+        outside : what pixels get that the recorded image does not show.
+        """
+        if self._lens is None:
+            return values
+        # By maps to 1/32 px OpenCV takes the farther neighbour (opencv/opencv#24106).
+        at = self._undistorted_from
+        return cv2.remap(values, at, None, cv2.INTER_NEAREST, borderValue=outside)  # type: ignore[call-overload]
 
     def check_focal_length(self, where: str) -> None:
         """Raise CameraError if a lens that is no fisheye has a view so wide that its unit is probably wrong.

@@ -102,6 +102,21 @@ def test_undistortion_maps_are_opencvs(camera):
     assert np.abs(ours.astype(int) - theirs)[5:-5, 5:-5].max() <= 2
 
 
+@pytest.mark.parametrize("camera", [PLAIN, BARREL, FISHEYE])
+def test_what_is_not_blended_comes_from_the_nearest_recorded_pixel(camera):
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    recorded = opencv_pixels(camera, camera.rays(pixels))
+    # Each recorded pixel's value says where it is.
+    values = (columns + 1000.0 * rows).astype(np.float32)
+    found = camera.undistort_unblended(values, np.nan).ravel()
+    taken = np.column_stack([found % 1000.0, found // 1000.0])
+    inside = ((recorded > 0.0) & (recorded < [639.0, 479.0])).all(axis=1)
+    assert np.abs(taken - recorded)[inside].max() < 0.501
+    outside = ((recorded < -1.0) | (recorded > [640.0, 480.0])).any(axis=1)
+    assert np.isnan(found[outside]).all()
+
+
 def test_wrong_lenses_are_refused():
     with pytest.raises(CameraError, match="unknown lens model 'mirror'"):
         Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (), "mirror")

@@ -415,9 +415,8 @@ class FrameImages:
         if depth is None:
             return None
         self.camera.check_image(depth, f"the depth image of frame {index}")
-        if self._maps is not None:
-            # Depths on both sides of an edge must not be blended.
-            depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan)  # type: ignore[assignment]
+        # Depths on both sides of an edge must not be blended.
+        depth = self.camera.undistort_unblended(depth, np.nan)
         return DepthImage(np.asarray(depth, dtype=np.float32), self.baseline_px)
 
     def _grey(self, image: Image, where: str, maps: tuple[NDArray, NDArray] | None) -> Image:

@@ -283,7 +283,7 @@ class Tracker:
             picture = Picture.of(frame, self.camera, self.options.use_depth)
             motion = self._history.motion(frame.timestamp if isinstance(frame, Frame) else None)
             image = ready or picture.made_ready(self._undistortion)
-            occluders = occluders_of(occluder_depth, self.camera, self._undistortion)
+            occluders = occluders_of(occluder_depth, self.camera)
             depth = None if picture.depth is None else self._depth_scale.corrected(picture.depth)
             image = replace(image, depth=depth, occluder_depth=occluders, motion=motion, is_taken=self.is_taken)
             if self._views is None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera, Maps
+from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, RegistrationError, TrackingError, check_kind
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import Registration
@@ -108,7 +108,7 @@ def widened(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.erode(depth, square), dtype=np.float32)
 
 
-def occluders_of(given: object, camera: Camera, undistortion: Maps | None) -> NDArray[np.float32] | None:
+def occluders_of(given: object, camera: Camera) -> NDArray[np.float32] | None:
     """What hides the object, as trackers take it: depth (h, w) in the undistorted image, infinite where nothing does.
 
     Parameters
@@ -116,7 +116,6 @@ def occluders_of(given: object, camera: Camera, undistortion: Maps | None) -> ND
     given : a mask (h, w) of bool in the picture as recorded, True where something hides the object; or the depth (h, w)
         of what may, metres, in the undistorted image: infinite, NaN or 0 where there is nothing; None for neither.
     camera : of the picture.
-    undistortion : its maps; None if it has no distortion.
 
     Raises
     ------
@@ -129,8 +128,7 @@ def occluders_of(given: object, camera: Camera, undistortion: Maps | None) -> ND
     if isinstance(given, np.ndarray) and given.dtype == np.bool_:
         hidden = given.astype(np.uint8)
         camera.check_image(hidden, where)
-        if undistortion is not None:
-            hidden = cv2.remap(hidden, *undistortion, interpolation=cv2.INTER_NEAREST)
+        hidden = camera.undistort_unblended(hidden, 0.0)
         # Whatever the object's own depth is, it is in front.
         return widened(np.where(hidden > 0, np.float32(0.0), np.float32(np.inf)))
     depth = camera.checked_depth(given, where).astype(np.float32, copy=False)  # type: ignore[arg-type]
