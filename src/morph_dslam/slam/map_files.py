@@ -22,8 +22,9 @@ from morph_dslam.slam.frame_images import FrameImages, FrameView
 from morph_dslam.slam.given_poses import PoseCheck
 from morph_dslam.slam.mapping import Mapper, do_all
 from morph_dslam.slam.options import INLIER_PX, LEAST_START_POINTS, PATCH_HALF
-from morph_dslam.slam.pose import PoseEstimate, inside, inverse, reprojection_errors
+from morph_dslam.slam.pose import PoseEstimate, inside, reprojection_errors
 from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
+from morph_dslam.slam.rolling_shutter import velocities
 from morph_dslam.slam.templates import image_pyramid
 from morph_dslam.slam.tracking import Tracked, Tracker, ViewsOf
 from morph_dslam.sources import FrameSource
@@ -52,20 +53,22 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
     tracker = _PosedTracker(rigid_map, images.camera)
     check = PoseCheck(trajectory.world_from_camera, np.asarray(images.camera.intrinsics))
     times, n_posed = [], 0
+    poses = trajectory.camera_from_world
+    twists = velocities(trajectory.timestamps, poses)
     for frame in source:
         times.append(frame.timestamp)
         nearest = int(np.abs(trajectory.timestamps - frame.timestamp).argmin())
         if abs(trajectory.timestamps[nearest] - frame.timestamp) > MOST_TIME_DIFFERENCE:
             continue
         n_posed += 1
-        pose = inverse(trajectory.world_from_camera[nearest])
+        pose, twist = poses[nearest], twists[nearest]
         view = images.prepare(frame.image, frame.index, frame.timestamp)
         check.add(view, nearest)
         if not rigid_map.keyframes:
-            mapper.begin_at(view, pose)
-            tracker.place(pose, rigid_map.keyframes[-1].seen)
+            mapper.begin_at(view, pose, twist)
+            tracker.place(pose, rigid_map.keyframes[-1].seen, view.timestamp)
             continue
-        tracked = tracker.track_at(view, pose)
+        tracked = tracker.track_at(view, pose, twist)
         if mapper.wants_keyframe(tracked, view.index):
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
@@ -104,16 +107,17 @@ def _check(
 class _PosedTracker(Tracker):
     """Follows points through frames of known pose."""
 
-    def track_at(self, view: FrameView, camera_from_world: Array) -> Tracked:
-        """The points of the next frame, at its pose (4, 4)."""
+    def track_at(self, view: FrameView, camera_from_world: Array, twist: Array) -> Tracked:
+        """The points of the next frame, at its pose (4, 4), where the camera has a velocity (6,), NaN if unknown."""
+        self._twist = twist
         found = self._follow(view.pyramid, self._followable(), camera_from_world, LEVELS + 1)
         found = found.joined(self._search(view.pyramid, camera_from_world, found.ids))
-        known = self._map.state[found.ids] == GOOD
-        positions, pixels = self._map.positions[found.ids[known]], found.pixels[known]
-        errors = reprojection_errors(camera_from_world, positions, pixels, self._intrinsics)
+        known = found[self._map.state[found.ids] == GOOD]
+        pixels = self._at_middle_row(known, camera_from_world).pixels
+        errors = reprojection_errors(camera_from_world, self._map.positions[known.ids], pixels, self._intrinsics)
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
         pose = PoseEstimate(camera_from_world, np.zeros((6, 6)), errors < INLIER_PX, rms)
-        result = self._tracked(view.normalized.shape, pose, found, NOWHERE)
+        result = replace(self._tracked(view.normalized.shape, pose, found, NOWHERE), twist=twist)
         self.camera_from_world, self.points = camera_from_world, result.points
         return result
 

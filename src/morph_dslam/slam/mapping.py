@@ -23,7 +23,7 @@ from morph_dslam.slam.least_squares_matching import Moves, measure_again
 from morph_dslam.slam.local_map import PointMaker, free_corners, gather, local_window, put_back
 from morph_dslam.slam.options import LEAST_INLIERS
 from morph_dslam.slam.pose import camera_centre, inverse, project
-from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, Followed, Indices, Keyframe, RigidMap
+from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, NOWHERE, UNKNOWN_TWIST, Followed, Indices, Keyframe, RigidMap
 from morph_dslam.slam.tracking import Tracked
 
 Array = NDArray[np.float64]
@@ -159,9 +159,12 @@ class Mapper:
         for keyframe, view in zip(self._map.keyframes, start.views, strict=True):
             do_all(keyframe.describe(view.frame.grey))
 
-    def begin_at(self, view: FrameView, camera_from_world: Array) -> int:
-        """Fill the empty map from one view at a pose (4, 4); returns how many points have a depth."""
-        number = self._map.add_keyframe(Keyframe.of_view(view, camera_from_world, NOWHERE))
+    def begin_at(self, view: FrameView, camera_from_world: Array, twist: Array = UNKNOWN_TWIST) -> int:
+        """Fill the empty map from one view at a pose (4, 4); returns how many points have a depth.
+
+        ``twist`` : (6,) the camera's velocity, as of `Keyframe`.
+        """
+        number = self._map.add_keyframe(Keyframe.of_view(view, camera_from_world, NOWHERE, twist))
         self._add_corners(number, view)
         do_all(self._map.keyframes[number].describe(view.grey))
         return int((self._map.state == GOOD).sum())

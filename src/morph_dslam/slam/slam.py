@@ -278,7 +278,8 @@ class Slam:
             points = self._start_metric(view) if self.map.is_metric else self._start_moving(view)
             if isinstance(points, NoPose):
                 return self._without_pose(view, SlamStatus.WAITING, points)
-            self._tracker.place(self.map.keyframes[-1].camera_from_world, points)
+            newest = self.map.keyframes[-1]
+            self._tracker.place(newest.camera_from_world, points, newest.timestamp)
             tracked = self._tracker.track(view)
         if isinstance(tracked, NoPose):
             self._restart()
@@ -341,7 +342,7 @@ class Slam:
                 return self._without_pose(view, SlamStatus.LOST, found)
             pose, points = found
             self._n_held = 0
-            self._tracker.place(pose.camera_from_world, points)
+            self._tracker.place(pose.camera_from_world, points, view.timestamp)
         tracked = Tracked(pose, points, int(pose.inliers.sum()), NOWHERE)
         return self._with_pose(view, SlamStatus.RELOCALIZED, tracked, is_keyframe=False)
 

@@ -186,16 +186,18 @@ class Tracker:
         self._map = rigid_map
         self._camera, self._intrinsics = camera, camera.intrinsics
         self._motion, self._twist, self.timestamp = np.eye(4), UNKNOWN_TWIST, -np.inf
+        # Of the newest pose, which may have been found by other means since.
+        self._pose_time = -np.inf
         self._templates, self._pyramids = Templates(self._intrinsics), dict[int, Pyramid]()
         self._views: FewViews | None = None
         self._astray = NOWHERE
         self.camera_from_world = np.eye(4)
         self.points = NOWHERE
 
-    def place(self, camera_from_world: Array, points: Followed) -> None:
-        """Go on from a pose found by other means, as if the camera had stood still."""
+    def place(self, camera_from_world: Array, points: Followed, timestamp: float) -> None:
+        """Go on from a pose of some time in seconds, found by other means, as if the camera had stood still."""
         self.camera_from_world, self.points, self._motion = camera_from_world, points, np.eye(4)
-        self._astray, self._twist = NOWHERE, UNKNOWN_TWIST
+        self._astray, self._twist, self._pose_time = NOWHERE, UNKNOWN_TWIST, timestamp
 
     def correct(self, before: Array, after: Array) -> None:
         """Move along with the newest keyframe, whose pose (4, 4) was ``before`` and now is ``after``."""
@@ -231,7 +233,8 @@ class Tracker:
             result = self._attempt(view, predicted, levels)
             if isinstance(result, Tracked):
                 self._motion = result.pose.camera_from_world @ inverse(self.camera_from_world)
-                gap, self.timestamp = view.timestamp - self.timestamp, view.timestamp
+                gap = view.timestamp - self._pose_time
+                self.timestamp = self._pose_time = view.timestamp
                 self._twist = twist_of(self._motion, gap) if 0.0 < gap < MOST_GAP_S else UNKNOWN_TWIST
                 result = replace(result, twist=self._twist)
                 self.camera_from_world = result.pose.camera_from_world

@@ -1,0 +1,79 @@
+"""Poses that are given to a map, and the velocities that a tracker takes from them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from morph_dslam.camera import Camera
+from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.slam.frame_images import FrameImages
+from morph_dslam.slam.map_files import map_from_trajectory
+from morph_dslam.slam.rigid_map import Followed
+from morph_dslam.slam.tracking import Tracked, Tracker
+from morph_dslam.sources.frames import Frame
+
+CAMERA, PX_PER_METRE, FPS = Camera(240, 180, 220.0, 220.0, 119.5, 89.5), 360.0, 30.0
+VELOCITY = np.array([0.5, 0.3, 0.0])
+
+
+class Wall:
+    """Frames of a textured wall at z = 1 m, before which a camera moves steadily; its rows are read over a time."""
+
+    name, fps = "wall", FPS
+
+    def __init__(self, readout_s, n=16):
+        rng = np.random.default_rng(0)
+        texture = cv2.GaussianBlur(rng.integers(0, 256, (700, 900), np.uint8), (0, 0), 2.0)
+        texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+        rows, columns = np.mgrid[:180, :240].astype(np.float32)
+        self.frames = []
+        for index in range(n):
+            times = index / FPS + readout_s * (rows - 89.5) / 180.0
+            x, y = (columns - 119.5) / 220.0 + 0.5 * times, (rows - 89.5) / 220.0 + 0.3 * times
+            at = (PX_PER_METRE * x + 300.0).astype(np.float32), (PX_PER_METRE * y + 300.0).astype(np.float32)
+            image = cv2.remap(texture, *at, cv2.INTER_CUBIC)
+            self.frames.append(Frame(index, index / FPS, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)))
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __iter__(self):
+        return iter(self.frames)
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.03])
+def test_a_readout_time_counts_where_poses_are_given(readout_s):
+    wall = Wall(readout_s)
+    poses = np.tile(np.eye(4), (len(wall), 1, 1))
+    times = np.arange(len(wall)) / FPS
+    poses[:, :3, 3] = times[:, None] * VELOCITY
+    images = FrameImages(replace(CAMERA, readout_s=readout_s))
+    found = map_from_trajectory(Trajectory(times, poses), wall, images)
+    for keyframe in found.keyframes:
+        # A world that stands still moves the other way in the camera's axes.
+        np.testing.assert_allclose(keyframe.twist, [0.0, 0.0, 0.0, *-VELOCITY], atol=1e-9)
+    depths = found.positions[found.good, 2]
+    assert len(depths) > 100
+    assert np.sqrt(np.mean((depths - 1.0) ** 2)) < 0.003
+
+
+def test_the_velocity_after_a_camera_was_found_again_is_that_since_then():
+    wall = Wall(0.0)
+    poses = np.tile(np.eye(4), (len(wall), 1, 1))
+    times = np.arange(len(wall)) / FPS
+    poses[:, :3, 3] = times[:, None] * VELOCITY
+    path, images = Trajectory(times, poses), FrameImages(CAMERA)
+    known = map_from_trajectory(path, wall, images)
+    views = [images.prepare(frame.image, frame.index, frame.timestamp) for frame in wall]
+    tracker = Tracker(known, CAMERA)
+    tracker.place(path.camera_from_world[0], known.keyframes[0].seen, times[0])
+    assert isinstance(tracker.track(views[1]), Tracked)
+    # The next two are lost; in the one after these the camera is found by other means.
+    in_view, pixels = known.good, CAMERA.project(known.positions[known.good] - poses[4, :3, 3])
+    inside = ((pixels > 0.0) & (pixels < [239.0, 179.0])).all(axis=1)
+    tracker.place(path.camera_from_world[4], Followed(in_view[inside], pixels[inside]), times[4])
+    tracked = tracker.track(views[5])
+    assert isinstance(tracked, Tracked)
+    np.testing.assert_allclose(tracked.twist[3:], -VELOCITY, atol=0.03)
