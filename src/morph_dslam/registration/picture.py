@@ -142,7 +142,7 @@ def load_picture(path: Path) -> PictureInitializer:
 
 def _matches(picture: Image, grey: Image) -> tuple[Array, Array]:
     """Pixels (k, 2) of similar features in the picture and in the frame (SIFT; Lowe 2004)."""
-    detector = cv2.SIFT_create(nfeatures=N_FEATURES)  # type: ignore[attr-defined]
+    detector = cv2.SIFT_create(nfeatures=N_FEATURES, enable_precise_upscale=True)  # type: ignore[attr-defined]
     ours, first = detector.detectAndCompute(picture, None)
     theirs, second = detector.detectAndCompute(grey, None)
     if first is None or second is None or len(first) < 2 or len(second) < 2:
