@@ -15,6 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numba import njit
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from morph_dslam.errors import CameraError
@@ -37,11 +38,41 @@ SAME_RATIO = 0.01
 COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5, 8), "fisheye": (4,)}
 
 
+#: A pixel outside of any image.
+NOWHERE_PX = -1e4
+#: Newton's starts are read from a table of so many angles from the axis, up to this one: close enough for it never to
+#: leave the way up to the fold.
+N_STARTS, WIDEST = 2048, np.radians(89.4)
+
+
+def _first_positive_root(*polynomials: Polynomial) -> float:
+    """The smallest positive real root of any of the polynomials; infinite if there is none."""
+    roots = np.concatenate([polynomial.trim().roots() for polynomial in polynomials])
+    return float(min(roots.real[(roots.imag == 0.0) & (roots.real > 0.0)], default=np.inf))
+
+
 class _RadialTangential:
     """Brown's radial and tangential distortion (1966) with OpenCV's rational extension, at unit focal length."""
 
     def __init__(self, coefficients: tuple[float, ...]) -> None:
         self._coefficients = (*coefficients, *([0.0] * (8 - len(coefficients))))
+
+    @cached_property
+    def fold(self) -> float:
+        """Ideal radius at which the radial part of the distortion stops growing, or has a pole; infinite for none."""
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients
+        s, above, below = Polynomial([0.0, 1.0]), Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+        growth = (above + 2.0 * s * above.deriv()) * below - 2.0 * s * above * below.deriv()
+        return float(np.sqrt(_first_positive_root(growth, below)))
+
+    @cached_property
+    def _starts(self) -> tuple[Array, Array]:
+        """Recorded radii (n,), and ideal ones (n,) that have them by the radial part, from the axis to the fold."""
+        # At the fold there is no slope to start with.
+        ideal = np.tan(np.linspace(0.0, min(np.arctan(self.fold), WIDEST), N_STARTS + 1))[:-1]
+        along = np.column_stack([ideal, np.zeros(N_STARTS), np.ones(N_STARTS)])
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients
+        return _RadialTangential((k1, k2, 0.0, 0.0, k3, k4, k5, k6)).image(along)[:, 0], ideal
 
     def image(self, points: Array) -> Array:
         """Image points (n, 2) of points (n, 3) in the camera frame; NaN for those not in front."""
@@ -58,11 +89,13 @@ class _RadialTangential:
         )
 
     def ideal(self, image_points: Array) -> Array:
-        """Pinhole image points (n, 2) of recorded ones (n, 2), by Newton's method from these.
+        """Pinhole image points (n, 2) of recorded ones (n, 2), by Newton's method from the radial part's inverse.
 
         NaN beyond the radius at which the distortion folds the image over, where coefficients mean nothing.
         """
-        points = np.column_stack([image_points, np.ones(len(image_points))]).astype(float)
+        distance = np.linalg.norm(image_points, axis=1)
+        scale = np.interp(distance, *self._starts) / np.where(distance > 0.0, distance, 1.0)
+        points = np.column_stack([scale[:, None] * image_points, np.ones(len(image_points))])
         with np.errstate(all="ignore"):
             for _ in range(MOST_ITERATIONS):
                 residual = self.image(points) - image_points
@@ -73,8 +106,10 @@ class _RadialTangential:
                 points[:, :2] -= np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
             missed = np.abs(self.image(points) - image_points).max(axis=1)
             (a, b), (c, d) = self._slopes(points)
-            # A negative determinant or trace: a solution on the far side of the fold.
-            good = (missed <= 1e3 * TOLERANCE) & (a * d - b * c > 0.0) & (a + d > 0.0)
+            # Behind the fold the image may grow again. A negative determinant or trace: the tangential part has
+            # brought the fold nearer.
+            good = (missed <= 1e3 * TOLERANCE) & (np.linalg.norm(points[:, :2], axis=1) < self.fold)
+            good &= (a * d - b * c > 0.0) & (a + d > 0.0)
         return np.where(good[:, None], points[:, :2], np.nan)
 
     def _slopes(self, points: Array) -> Array:
@@ -100,6 +135,12 @@ class _Fisheye:
     def __init__(self, coefficients: tuple[float, ...]) -> None:
         self._coefficients = coefficients
 
+    @cached_property
+    def fold(self) -> float:
+        """Angle from the axis at which the image radius stops growing; infinite for none."""
+        growth = [1.0, *(k * (2 * i + 3) for i, k in enumerate(self._coefficients))]
+        return float(np.sqrt(_first_positive_root(Polynomial(growth))))
+
     def _radius(self, angle: Array) -> tuple[Array, Array]:
         """Image radius (n,) and its derivative by the angle (n,)."""
         k1, k2, k3, k4 = self._coefficients
@@ -123,16 +164,16 @@ class _Fisheye:
         NaN where no direction within a right angle of the axis is imaged, and beyond the fold.
         """
         distance = np.linalg.norm(image_points, axis=1)
-        angle = np.minimum(distance, 0.5 * np.pi)
+        angles = np.linspace(0.0, min(self.fold, 0.5 * np.pi), N_STARTS + 1)[:-1]
+        angle = np.interp(distance, self._radius(angles)[0], angles)
         with np.errstate(all="ignore"):
             for _ in range(MOST_ITERATIONS):
                 radius, slope = self._radius(angle)
                 if not (np.abs(radius - distance) > TOLERANCE).any():
                     break
                 angle = angle - (radius - distance) / slope
-            radius, slope = self._radius(angle)
-            good = (np.abs(radius - distance) <= 1e3 * TOLERANCE) & (slope > 0.0)
-            good &= (angle >= 0.0) & (angle < 0.5 * np.pi)
+            radius, _ = self._radius(angle)
+            good = (np.abs(radius - distance) <= 1e3 * TOLERANCE) & (angle < min(self.fold, 0.5 * np.pi))
             scale = np.where(distance > 0.0, np.tan(angle) / distance, 1.0)
         return np.where(good[:, None], scale[:, None] * image_points, np.nan)
 
@@ -244,7 +285,10 @@ class Camera:
         return np.column_stack([x, y, np.ones(len(pixels))])
 
     def project_recorded(self, points: Array) -> Array:
-        """Pixels (n, 2), in the image as recorded, of points (n, 3) in the camera frame; NaN where unseen."""
+        """Pixels (n, 2), in the image as recorded, of points (n, 3) in the camera frame; NaN where not in front.
+
+        Beyond the fold of a lens, where nothing is seen, they are what its formula says: estimates need it smooth.
+        """
         if self._lens is None:
             return self.project(points)
         return self._pixels(self._lens.image(points))
@@ -288,8 +332,12 @@ class Camera:
         return cv2.convertMaps(self._seen_at(rays), None, cv2.CV_16SC2)  # type: ignore[call-overload]
 
     def _seen_at(self, rays: Array) -> NDArray[np.float32]:
-        """Where the camera records the ray (h * w, 3) of each pixel, (h, w, 2)."""
-        return self.project_recorded(rays).astype(np.float32).reshape(self.height, self.width, 2)
+        """Where the camera records the ray (h * w, 3) of each pixel, (h, w, 2); outside of the image beyond a fold."""
+        pixels = self.project_recorded(rays).astype(np.float32)
+        if isinstance(self._lens, _RadialTangential):
+            pixels[np.hypot(rays[:, 0], rays[:, 1]) >= self._lens.fold * rays[:, 2]] = np.nan
+        # What OpenCV makes of NaN depends on the processor.
+        return np.nan_to_num(pixels, nan=NOWHERE_PX).reshape(self.height, self.width, 2)
 
     @cached_property
     def _undistorted_from(self) -> NDArray[np.float32]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import CameraError
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.camera_doubts import camera_doubts
 
 PLAIN = Camera(640, 480, 528.0, 531.0, 318.5, 241.2)
 BARREL = Camera(640, 480, 528.0, 531.0, 318.5, 241.2, (-0.28, 0.09, 1e-3, -5e-4, 0.02))
@@ -89,6 +90,52 @@ def test_pixels_beyond_the_fold_of_the_distortion_are_not_undistorted():
     found = folding.undistort_pixels(np.array([inside, outside]))
     np.testing.assert_allclose(found[0], [470.0, 240.0], atol=1e-6)
     assert np.isnan(found[1]).all()
+
+
+#: r - r^3 / 2 + r^5 / 10 grows up to 0.6 at r = 1, falls to r = sqrt(2), and grows again; the fisheye's r is an angle.
+GROWS_AGAIN = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, (-0.5, 0.1, 0.0, 0.0))
+FISHEYE_GROWS_AGAIN = replace(GROWS_AGAIN, distortion=(-0.5, 0.1, 0.0, 0.0), lens_model="fisheye")
+
+
+@pytest.mark.parametrize("camera", [GROWS_AGAIN, FISHEYE_GROWS_AGAIN])
+def test_the_inverse_of_a_lens_ends_at_its_fold_though_the_image_grows_again_behind_it(camera):
+    def recorded_at(r):
+        radius = r - r**3 / 2.0 + r**5 / 10.0
+        directions = np.deg2rad(np.arange(0.0, 360.0, 30.0))
+        x, y = np.outer(radius, np.cos(directions)), np.outer(radius, np.sin(directions))
+        return 400.0 * np.stack([x, y], axis=-1).reshape(-1, 2) + [319.5, 239.5]
+
+    before = np.linspace(0.01, 0.999, 200)
+    rays = camera.rays(camera.undistort_pixels(recorded_at(before)))
+    found = np.hypot(rays[:, 0], rays[:, 1]).reshape(200, 12)
+    expected = np.tan(before) if camera is FISHEYE_GROWS_AGAIN else before
+    np.testing.assert_allclose(found, np.tile(expected[:, None], (1, 12)), rtol=1e-5)
+    beyond = recorded_at(np.linspace(2.0, 2.3, 50))  # radii from 1.2, which are larger than 0.6
+    assert np.isnan(camera.undistort_pixels(beyond)).all()
+    just_beyond = np.array([[319.5 + 400.0 * radius, 239.5] for radius in np.linspace(0.6001, 0.7, 50)])
+    assert np.isnan(camera.undistort_pixels(just_beyond)).all()
+
+
+@pytest.mark.parametrize("distortion", [RATIONAL.distortion, (0.25, -0.1, 0.0, 0.0, 0.04), (-0.2, 0.06, 1e-3, 1e-3)])
+def test_each_pixel_before_the_fold_has_its_ray(distortion):
+    lens = replace(PLAIN, fx=300.0, fy=300.0, distortion=distortion)
+    columns, rows = np.meshgrid(np.linspace(0.0, 639.0, 40), np.linspace(0.0, 479.0, 30))
+    rays = PLAIN.rays(np.column_stack([columns.ravel(), rows.ravel()])) * [1.5, 1.5, 1.0]
+    found = lens.rays(lens.undistort_pixels(opencv_pixels(lens, rays)))
+    np.testing.assert_allclose(found, rays, atol=1e-6)
+
+
+def test_what_is_beyond_the_fold_is_not_undistorted_and_a_doubt_says_how_much_of_the_picture_that_is():
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    radius = np.hypot(columns - 319.5, rows - 239.5) / 400.0
+    wide = replace(GROWS_AGAIN, fx=300.0, fy=300.0)
+    white = np.full((480, 640), 255, np.uint8)
+    undistorted = cv2.remap(white, *wide.undistortion_maps(), cv2.INTER_LINEAR)
+    assert not undistorted[radius * 4.0 / 3.0 > 1.01].any()
+    assert (undistorted[radius * 4.0 / 3.0 < 0.99] == 255).all()
+    (doubt,) = camera_doubts(wide)
+    share = float(re.search(r"in (\d+)% of it", doubt)[1])
+    assert abs(share - 100.0 * (radius * 4.0 / 3.0 > 0.6).mean()) < 5.0
 
 
 @pytest.mark.parametrize("camera", [BARREL, FISHEYE])
