@@ -132,7 +132,7 @@ def calibrate_rig(
         best = best_views(found)
         cameras.append(Calibration(solve_intrinsics(best.views, board, best.size, lens_model), best, board, picture))
         seen.append(_by_number(_with_shape(found.views, cameras[0].solution.shape)))
-    rig = _solve(cameras, seen)
+    rig = solve_rig(cameras, seen)
     rig.check()
     if output is not None:
         lenses = [calibration.solution.camera for calibration in cameras]
@@ -176,19 +176,38 @@ class _Sighting:
     camera_from_board: RigidTransform
 
 
-def _solve(cameras: Sequence[Calibration], seen: Sequence[dict[int, View]]) -> RigCalibration:
-    shared = sorted({n for a, b in combinations(seen, 2) for n in a.keys() & b.keys()})
+def _shared(seen: Sequence[dict[int, View]]) -> set[int]:
+    """Numbers of the frames that two cameras or more saw."""
+    return {n for a, b in combinations(seen, 2) for n in a.keys() & b.keys()}
+
+
+def solve_rig(cameras: Sequence[Calibration], seen: Sequence[dict[int, View]]) -> RigCalibration:
+    """Where the cameras are to each other.
+
+    Parameters
+    ----------
+    cameras : (n) calibration of each by itself.
+    seen : (n) the views of each by the numbers of their frames.
+
+    Raises
+    ------
+    CameraError
+        If a camera shares too few frames with the others, or too few of those that fit the others.
+    """
+    of_cameras, given = [calibration.solution.camera for calibration in cameras], _shared(seen)
+    seen = [_with_rays(camera, views) for camera, views in zip(of_cameras, seen, strict=True)]
+    shared = sorted(_shared(seen))
+    left_out = sorted(given.difference(shared))
     first = [next(views[n] for views in seen if n in views) for n in shared]
     if shared:
         shared = [shared[i] for i in select_by_coverage(first, cameras[0].found.size)]
-    of_cameras = [calibration.solution.camera for calibration in cameras]
     sightings = [
         _Sighting(camera, frame, seen[camera][frame], _board_pose(of_cameras[camera], seen[camera][frame]))
         for frame in shared
         for camera in range(len(seen))
         if frame in seen[camera]
     ]
-    poses, left_out = _first_poses(of_cameras, sightings), []
+    poses = _first_poses(of_cameras, sightings, len(left_out))
     while True:
         solved = _Adjustment(of_cameras, sightings, poses)
         rms = solved.rms_of_frames()
@@ -197,10 +216,17 @@ def _solve(cameras: Sequence[Calibration], seen: Sequence[dict[int, View]]) -> R
             break
         left_out += sorted(bad)
         sightings = [sighting for sighting in sightings if sighting.frame not in bad]
+        # A camera all of whose frames are left out is nowhere.
+        _first_poses(of_cameras, sightings, len(left_out))
         poses = solved.poses
     used = tuple(sorted(rms))
     deviations = np.hypot(solved.deviations(), _by_intrinsics(cameras, sightings))
-    return RigCalibration(tuple(cameras), solved.poses, deviations, solved.rms, used, tuple(left_out))
+    return RigCalibration(tuple(cameras), solved.poses, deviations, solved.rms, used, tuple(sorted(left_out)))
+
+
+def _with_rays(camera: Camera, views: dict[int, View]) -> dict[int, View]:
+    """Those of the views all of whose corners are where the camera's lens shows something."""
+    return {n: view for n, view in views.items() if np.isfinite(camera.undistort_pixels(view.corners)).all()}
 
 
 def _by_intrinsics(cameras: Sequence[Calibration], sightings: Sequence[_Sighting]) -> Array:
@@ -221,10 +247,14 @@ def _board_pose(camera: Camera, view: View) -> RigidTransform:
     return RigidTransform(rotation_exp(np.ravel(turn).astype(float)), np.ravel(shift).astype(float))
 
 
-def _first_poses(cameras: Sequence[Camera], sightings: Sequence[_Sighting]) -> tuple[RigidTransform, ...]:
+def _first_poses(
+    cameras: Sequence[Camera], sightings: Sequence[_Sighting], n_left_out: int
+) -> tuple[RigidTransform, ...]:
     """camera_from_first, each by the camera placed before that shares most frames with it.
 
     Of the poses that the shared frames give, the one is taken by which their corners are off least in the median.
+
+    Raises CameraError if one shares too few, besides those that were left out.
     """
     views = {(sighting.camera, sighting.frame): sighting for sighting in sightings}
     frames = [{frame for number, frame in views if number == camera} for camera in range(len(cameras))]
@@ -233,9 +263,10 @@ def _first_poses(cameras: Sequence[Camera], sightings: Sequence[_Sighting]) -> t
         pairs = [(len(frames[a] & frames[b]), a, b) for a in placed for b in range(len(cameras)) if b not in placed]
         count, a, b = max(pairs)
         if count < FEWEST_SHARED:
+            besides = f", {n_left_out} more do not fit the others" if n_left_out else ""
             raise CameraError(
-                f"camera {b} saw the board in {count} frames together with another one; {FEWEST_SHARED} are needed, 15 "
-                "are good: hold it where two cameras see it, and give frames of one instant the same number"
+                f"camera {b} saw the board in {count} frames together with another one{besides}; {FEWEST_SHARED} are "
+                "needed, 15 are good: hold it where two cameras see it, and give frames of one instant the same number"
             )
         both = [(views[a, frame], views[b, frame]) for frame in sorted(frames[a] & frames[b])]
         found = [by_b.camera_from_board @ by_a.camera_from_board.inverse for by_a, by_b in both]
