@@ -18,6 +18,7 @@ from morph_dslam.registration.messages import (
     PoorFit,
     Underdetermined,
 )
+from morph_dslam.registration.registration import load_registration
 from morph_dslam.registration.starts import shape_starts, solve_pnp
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
@@ -91,6 +92,22 @@ def test_landmarks_may_be_lists():
     for points, pixels in (([[0.0, 0.0]], [[1.0, 2.0]]), ([[0.0] * 3], [[1.0, 2.0]] * 2), ([["a"] * 3], [[1.0, 2.0]])):
         with pytest.raises(RegistrationError, match="of landmarks"):
             Landmarks(points, pixels)
+
+
+def test_landmarks_that_are_not_finite_are_named():
+    exact = landmarks()
+    for name, off in (("points", np.nan), ("pixels", np.nan), ("points", np.inf)):
+        given = {"points": exact.points.copy(), "pixels": exact.pixels.copy()}
+        given[name][3, 1] = off
+        with pytest.raises(RegistrationError, match=f"{name} of landmark 4"):
+            Landmarks(**given)
+
+
+@pytest.mark.parametrize("frames", [[1.5] * 14, [-1] * 14, [np.inf] * 14, [1] * 13])
+def test_frames_of_landmarks_are_whole_numbers(frames):
+    exact = landmarks()
+    with pytest.raises(RegistrationError, match="frame"):
+        Landmarks(exact.points, exact.pixels, frames)
 
 
 @pytest.mark.parametrize(
@@ -200,6 +217,8 @@ def test_spreadsheet_habits_are_accepted(tmp_path):
         (HEADER + "1,2,3,4\n", "landmark 1 is '1,2,3,4'"),
         (HEADER + "1,2,3,4,5\n1,2,x,4,5\n", "landmark 2"),
         (HEADER + "1,2,nan,4,5\n", "landmark 1"),
+        ("frame," + HEADER + "3,1,2,3,4,5\n12.7,1,2,3,4,5\n", r"landmarks\.csv.*landmark 2 is of frame 12\.7"),
+        ("frame," + HEADER + "-3,1,2,3,4,5\n", "landmark 1 is of frame -3"),
         (None, r"landmarks\.csv"),
     ],
 )
@@ -232,10 +251,13 @@ def test_an_object_at_rest_has_the_pose_that_opencv_finds():
     assert (np.abs(away) < 4.0 * np.sqrt(np.diag(found.covariance)[d + 3 :])).all()
 
 
-def test_an_object_that_is_not_at_rest_is_named_with_what_the_landmarks_alone_give():
-    """Clicks of 0.5 px on a sheet that is arched by 25 mm."""
+def test_an_object_that_is_not_at_rest_is_named_with_what_the_landmarks_alone_give(tmp_path):
+    """Clicks of 0.5 px on a sheet that is arched by 25 mm; in a file it stands as well."""
     arched = landmarks(State(np.array([0.025, 0.0, 0.0]), POSE), noise=0.5)
-    (said,) = register_landmarks(MODEL, CAMERA, arched, at_rest=True).warnings
+    found = register_landmarks(MODEL, CAMERA, arched, at_rest=True)
+    found.save(tmp_path / "registration.json")
+    assert load_registration(tmp_path / "registration.json", MODEL).warnings == found.warnings
+    (said,) = found.warnings
     assert isinstance(said, NotAtRest)
     name, value, unit = said.parameters.replace("=", "").split()
     assert (name, float(value), unit) == ("arch", pytest.approx(25.0, abs=1.5), "mm")

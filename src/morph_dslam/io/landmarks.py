@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.errors import RegistrationError
 from morph_dslam.io.text import read_csv
@@ -34,7 +34,7 @@ class Landmarks:
     Raises
     ------
     RegistrationError
-        If these are no numbers, or not of as many landmarks.
+        If these are no finite numbers, or not of as many landmarks, or a frame has no whole number from 0 on.
     """
 
     points: NDArray[np.float64]
@@ -52,9 +52,27 @@ class Landmarks:
                     f"{name} of landmarks have the shape {values.shape}: give points (k, 3) in metres and as many "
                     "pixels (k, 2)"
                 )
+            unknown = np.flatnonzero(~np.isfinite(values).all(axis=1))
+            if len(unknown):
+                raise RegistrationError(
+                    f"{name} of landmark {unknown[0] + 1} are {values[unknown[0]].tolist()}: give finite numbers, or "
+                    "leave the landmark out"
+                )
             object.__setattr__(self, name, values)
         if self.frames is not None:
-            object.__setattr__(self, "frames", np.asarray(self.frames, dtype=np.int64))
+            object.__setattr__(self, "frames", self._whole(self.frames))
+
+    def _whole(self, frames: ArrayLike) -> NDArray[np.int64]:
+        """Numbers of frames (k,), checked."""
+        values = np.asarray(frames)
+        if values.shape != (len(self.points),) or values.dtype.kind not in "iuf":
+            raise RegistrationError(f"frames of landmarks are {frames}: give the number of each landmark's frame")
+        wrong = np.flatnonzero(~((values >= 0) & (values < LARGEST) & (values == np.floor(values))))
+        if len(wrong):
+            raise RegistrationError(
+                f"landmark {wrong[0] + 1} is of frame {values[wrong[0]]:g}: frames are counted 0, 1, 2, ..."
+            )
+        return values.astype(np.int64)
 
 
 def load_landmarks(path: str | Path) -> Landmarks:
@@ -72,8 +90,11 @@ def load_landmarks(path: str | Path) -> Landmarks:
         )
     values = np.array([_values(path, number, row, header) for number, row in enumerate(rows[1:], start=1)])
     values = values.reshape(-1, len(header))
-    frames = values[:, 0].astype(np.int64) if len(header) > len(HEADER) else None
-    return Landmarks(1e-3 * values[:, -5:-2], np.ascontiguousarray(values[:, -2:]), frames)
+    frames = values[:, 0] if len(header) > len(HEADER) else None
+    try:
+        return Landmarks(1e-3 * values[:, -5:-2], np.ascontiguousarray(values[:, -2:]), frames)
+    except RegistrationError as error:
+        raise RegistrationError(f"{path}: {error}") from error
 
 
 def _values(path: Path, number: int, row: list[str], header: tuple[str, ...]) -> list[float]:

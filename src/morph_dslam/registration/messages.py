@@ -559,8 +559,15 @@ class OnlyInBox(RegistrationWarning):
     frame: int
 
 
+def _kinds(kind: type[RegistrationWarning]) -> dict[str, type[RegistrationWarning]]:
+    """All kinds of warnings that are narrower than this one, by their names."""
+    kinds = {}
+    for narrower in kind.__subclasses__():
+        kinds |= {narrower.__name__: narrower, **_kinds(narrower)}
+    return kinds
+
+
 def read_warning(content: Mapping[str, Any]) -> RegistrationWarning:
     """A warning from what `Notice.content` gave; raises KeyError or TypeError if it is none."""
-    kinds = {kind.__name__: kind for kind in RegistrationWarning.__subclasses__()}
-    kind = kinds["".join(part.capitalize() for part in content["kind"].split("_"))]
+    kind = _kinds(RegistrationWarning)["".join(part.capitalize() for part in content["kind"].split("_"))]
     return kind(**{field.name: content[field.name] for field in fields(kind)})
