@@ -265,6 +265,16 @@ def test_an_object_that_is_not_at_rest_is_named_with_what_the_landmarks_alone_gi
     assert said.sigma_px > 2.0 * said.free_px
 
 
+@pytest.mark.parametrize(("count", "enough"), [(4, 6), (5, 6), (6, None), (7, None)])
+def test_at_rest_the_pose_alone_is_unknown(count, enough):
+    """Four landmarks are 8 numbers for 6 unknowns; six leave 6 to spare, which show how exact they are."""
+    some = landmarks(State(np.zeros(3), POSE), noise=0.5)
+    few = Landmarks(some.points[:count], some.pixels[:count])
+    said = register_landmarks(MODEL, CAMERA, few, at_rest=True).warnings
+    assert [type(warning) for warning in said] == ([] if enough is None else [FewLandmarks])
+    assert all(warning.enough == enough for warning in said)
+
+
 def test_an_object_that_is_not_at_rest_is_named_though_its_landmarks_fit_at_rest():
     """An arch of 18 mm, seen from the front and 0.8 m away, is less than a pixel beside a pose of the flat sheet."""
     away = RigidTransform(POSE.rotation, np.array([0.02, -0.01, 0.8]))

@@ -122,7 +122,7 @@ def fit_landmarks(
         found = _with_other_tilts(estimator, landmarks, found, click_px)
     if at_rest:
         found = [_of_pose_alone(estimator, points, pixels, estimate) for estimate in found]
-    plausible = plausible_minima(found, click_px)
+    plausible = plausible_minima(found, click_px, estimator.box.n_unknowns)
     _check_residual(estimator, landmarks, plausible[0])
     return LandmarkFit(estimator, landmarks, plausible, click_px)
 
@@ -135,7 +135,7 @@ def _with_other_tilts(
     Landmarks that lie nearly in a plane fit nearly as well there if they are far away, and PnP gives one tilt alone.
     """
     points, starts = landmarks.points, list[State]()
-    best, *others = (estimate.state for estimate in plausible_minima(found, click_px))
+    best, *others = (estimate.state for estimate in plausible_minima(found, click_px, estimator.box.n_unknowns))
     for state in [best, *distinct_states(estimator.model, best, others)][:MOST_TILTS]:
         positions = points.rest + points.field.value(state.parameters)
         starts.append(State(state.parameters, mirrored_tilt(positions, state.camera_from_object)))
@@ -197,7 +197,7 @@ def _of_pose_alone(estimator: PointsEstimator, bound: BoundPoints, pixels: Array
     """An estimate whose parameters were known, with the covariance of the pose alone."""
     d, covariance = len(estimator.model.parameters), np.zeros_like(found.covariance)
     _, hessian, _, _ = estimator.evaluate(bound, pixels, np.ones(len(bound)), found.state)
-    freedom = max(2 * len(bound) - 6, 1)
+    freedom = max(2 * len(bound) - estimator.box.n_unknowns, 1)
     variance = max(2.0 * found.cost / freedom, LEAST_PX**2)
     scale = estimator.scale[d:]
     covariance[d:, d:] = variance * np.outer(scale, scale) * np.linalg.pinv(hessian[d:, d:] * np.outer(scale, scale))

@@ -314,7 +314,7 @@ def _of_residuals(
 
     A scale of the depths that is not the likeliest counts as a residual.
     """
-    numbers, unknowns, click_px = 2 * len(fit.landmarks), len(fit.estimator.model.parameters) + 6, fit.click_px
+    numbers, unknowns, click_px = 2 * len(fit.landmarks), fit.estimator.box.n_unknowns, fit.click_px
     alone_px = fit.best.sigma_px
     if numbers <= unknowns:
         return Underdetermined(numbers, unknowns, unknowns // 2 + 3)

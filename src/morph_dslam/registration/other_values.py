@@ -70,10 +70,17 @@ def other_values(model: ReducedModel, best: FoundValues, others: Sequence[FoundV
     return (OtherValues("; ".join(named)),) if named else ()
 
 
-def plausible_minima(found: list[Estimate], click_px: float) -> list[Estimate]:
-    """The best minimum, and others that landmarks of the stated accuracy cannot exclude."""
+def plausible_minima(found: list[Estimate], click_px: float, n_unknowns: int) -> list[Estimate]:
+    """The best minimum, and others that landmarks of the stated accuracy cannot exclude.
+
+    Parameters
+    ----------
+    found : the minima, the best first.
+    click_px : standard deviation of a carefully set landmark.
+    n_unknowns : that were estimated; parameters whose values are known are none.
+    """
     best = found[0]
-    freedom = max(2 * len(best.residuals) - len(best.covariance), 1)
+    freedom = max(2 * len(best.residuals) - n_unknowns, 1)
     variance = max(click_px**2, 2.0 * best.cost / freedom)
     # Twice the log-likelihood ratio of two minima.
     return [best, *(e for e in found[1:] if 2.0 * (e.cost - best.cost) < EXCLUDED * variance)]

@@ -170,7 +170,7 @@ class OutlineSnap:
             seen = self._agreeing(outline.measure(self._grey, state, reach), state)
             estimate = self._estimator.estimate(*self._measured(seen, sigma, redundancy * variance).at(state))
             balance, state = OutlineBalance(), estimate.state
-            balance.learn_outline(seen, estimate.residuals[k:], self._n_unknowns)
+            balance.learn_outline(seen, estimate.residuals[k:], self._estimator.box.n_unknowns)
             if np.isfinite(balance.outline.variance):
                 redundancy = balance.outline.redundancy
                 variance = max(balance.outline.variance, LEAST_SPREAD_PX**2)
@@ -178,11 +178,6 @@ class OutlineSnap:
             sigma = max(self._sigma, float(np.sqrt(np.mean(estimate.residuals[:k] ** 2))))
             outline.take_brightness(self._grey, state)
         return self._judged(by_landmarks, estimate, seen, sigma, variance, redundancy)
-
-    @property
-    def _n_unknowns(self) -> int:
-        box = self._estimator.box
-        return int((box.upper > box.lower).sum()) + 6
 
     def _agreeing(self, seen: OutlineMeasurement, state: State) -> OutlineMeasurement:
         """Those points of an outline that are as far off the state as most of them, or less."""
@@ -214,7 +209,7 @@ class OutlineSnap:
         variance: float,
         redundancy: float,
     ) -> Snap:
-        k, n, ones = len(self._pixels), self._n_unknowns, np.ones(len(self._pixels))
+        k, n, ones = len(self._pixels), self._estimator.box.n_unknowns, np.ones(len(self._pixels))
         measured = self._measured(seen, sigma, redundancy * variance)
         hessian = self._estimator.evaluate(*measured.at(estimate.state))[1]
         alone, beside = (

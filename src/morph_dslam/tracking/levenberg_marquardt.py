@@ -128,6 +128,11 @@ class Box:
         half_ranges = 0.5 * (model.upper - model.lower)
         return cls(model.lower, model.upper, np.concatenate([half_ranges, np.ones(3), np.full(3, size)]))
 
+    @property
+    def n_unknowns(self) -> int:
+        """How many there are: parameters whose values are left open, and the pose."""
+        return int((self.upper > self.lower).sum()) + 6
+
     def nearest(self, state: State) -> State:
         """The state with its parameters inside the box."""
         inside = np.minimum(np.maximum(state.parameters, self.lower), self.upper)
