@@ -265,6 +265,29 @@ def test_an_object_that_is_not_at_rest_is_named_with_what_the_landmarks_alone_gi
     assert said.sigma_px > 2.0 * said.free_px
 
 
+def test_landmarks_on_a_line_of_an_object_at_rest_are_refused():
+    row = np.flatnonzero(np.abs(MODEL.nodes[:, 1] - MODEL.nodes[8 * 22, 1]) < 1e-9)[::3]
+    pixels = CAMERA.project(POSE.apply(MODEL.nodes[row]))
+    pixels += 0.5 * np.random.default_rng(1).standard_normal(pixels.shape)
+    with pytest.raises(RegistrationError, match="on one line"):
+        register_landmarks(MODEL, CAMERA, Landmarks(MODEL.nodes[row], pixels), at_rest=True)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_landmarks_close_to_a_line_have_the_deviation_of_the_turn_about_it(seed):
+    """One of seven is 20 mm beside the line of the others."""
+    row = np.flatnonzero(np.abs(MODEL.nodes[:, 1] - MODEL.nodes[8 * 22, 1]) < 1e-9)[::3].copy()
+    row[3] += 22
+    pixels = CAMERA.project(POSE.apply(MODEL.nodes[row]))
+    pixels += 0.5 * np.random.default_rng(seed).standard_normal(pixels.shape)
+    found = register_landmarks(MODEL, CAMERA, Landmarks(MODEL.nodes[row], pixels), at_rest=True)
+    line, d = POSE.rotation[:, 0], len(MODEL.parameters)
+    turn = rotation_log(found.state.camera_from_object.rotation @ POSE.rotation.T) @ line
+    deviation = np.sqrt(line @ found.covariance[d : d + 3, d : d + 3] @ line)
+    assert abs(turn) < 4.0 * deviation
+    assert np.deg2rad(1.0) < deviation < np.deg2rad(10.0)
+
+
 @pytest.mark.parametrize(("count", "enough"), [(4, 6), (5, 6), (6, None), (7, None)])
 def test_at_rest_the_pose_alone_is_unknown(count, enough):
     """Four landmarks are 8 numbers for 6 unknowns; six leave 6 to spare, which show how exact they are."""

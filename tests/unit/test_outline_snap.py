@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.model import Parameter, SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.landmarks import register_landmarks
-from morph_dslam.registration.messages import OutlineContradicts, OutlineInexact, OutlineUnseen
+from morph_dslam.registration.messages import AtBound, OutlineContradicts, OutlineInexact, OutlineUnseen
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, colours, mean_error, sheet_state
 
@@ -56,6 +58,31 @@ def test_a_state_that_misses_part_of_the_outline_does_not_fit_best(seed):
     image, landmarks = SheetFilm(MODEL, seed=seed).frame(truth), clicked(truth, seed)
     found = register_landmarks(MODEL, CAMERA, landmarks, image=image)
     assert mean_error(MODEL, found.state, truth) < 1e-3
+
+
+def with_modulus(model):
+    """The model with one more parameter, which no image shows: of a ratio that changes no displacement."""
+    known = model.displacement.functions
+    lower, upper = known.bounds
+    indices = np.column_stack([known.multi_indices, np.zeros(len(known.multi_indices), dtype=np.int64)])
+    functions = ParameterFunctions(np.append(lower, -1.0), np.append(upper, 1.0), indices, known.coefficients)
+    modulus = Parameter("modulus", "ratio", "1", -1.0, 1.0, 0.0, "acts on the stress alone")
+    field = SeparatedField(model.displacement.modes, functions)
+    return replace(model, parameters=(*model.parameters, modulus), displacement=field, stresses={})
+
+
+def test_what_neither_landmarks_nor_outline_show_is_not_known_beside_the_outline():
+    truth, arch = sheet_state(0.3), bent_sheet_model(22, 16, known=1)
+    truth = replace(truth, parameters=truth.parameters[:1])
+    image, landmarks = SheetFilm(arch).frame(truth), clicked(truth, seed=1, sigma_px=0.7, model=arch)
+    without = register_landmarks(arch, CAMERA, landmarks, image=image)
+    found = register_landmarks(with_modulus(arch), CAMERA, landmarks, image=image)
+    assert found.facts["corrected_by_outline"]
+    assert found.state.parameters[1] == pytest.approx(0.0, abs=1e-6)
+    deviations = np.sqrt(np.diag(found.covariance))
+    assert deviations[1] > 2.0  # more than its range
+    np.testing.assert_allclose(np.delete(deviations, 1), np.sqrt(np.diag(without.covariance)), rtol=0.3)
+    assert not any(isinstance(warning, AtBound) for warning in found.warnings)
 
 
 def with_margin(margin):

@@ -12,7 +12,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks
+from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks, check_beside_line
 from morph_dslam.registration.messages import NotAtRest
 from morph_dslam.registration.other_values import as_set, plausible_minima
 from morph_dslam.registration.outline_snap import distinct_states
@@ -20,6 +20,7 @@ from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import pose_starts, shape_starts
+from morph_dslam.tracking.covariance import floored_inverse
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, State
 from morph_dslam.tracking.other_tilt import mirrored_tilt
 from morph_dslam.tracking.rig import PointsEstimator, RigCamera
@@ -108,9 +109,11 @@ def fit_landmarks(
     at_rest : whether the parameters are their defaults.
     near : a state close by that alone is started from; None for shapes spread over the parameters' ranges.
 
-    Raises RegistrationError if nothing explains them.
+    Raises RegistrationError if nothing explains them, or they are on one line of an object at rest.
     """
     points, pixels = landmarks.points, landmarks.pixels
+    if at_rest:
+        check_beside_line(points.rest)
     estimator = _estimator(model, cameras, landmarks, at_rest)
     shapes = shape_starts(model)
     if at_rest or 2 * len(landmarks) < len(model.parameters) + 6:
@@ -200,7 +203,7 @@ def _of_pose_alone(estimator: PointsEstimator, bound: BoundPoints, pixels: Array
     freedom = max(2 * len(bound) - estimator.box.n_unknowns, 1)
     variance = max(2.0 * found.cost / freedom, LEAST_PX**2)
     scale = estimator.scale[d:]
-    covariance[d:, d:] = variance * np.outer(scale, scale) * np.linalg.pinv(hessian[d:, d:] * np.outer(scale, scale))
+    covariance[d:, d:] = variance * np.outer(scale, scale) * floored_inverse(hessian[d:, d:] * np.outer(scale, scale))
     return replace(found, covariance=covariance, at_bound=np.zeros(d, dtype=bool), sigma_px=float(np.sqrt(variance)))
 
 

@@ -20,6 +20,7 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.registration.messages import OutlineContradicts, OutlineInexact, OutlineUnseen, RegistrationWarning
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.tracking.binding import DrawnSurface
+from morph_dslam.tracking.covariance import floored_inverse
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.outline import Outline, OutlineMeasurement
 from morph_dslam.tracking.outline_weight import LEAST_SPREAD_PX, OutlineBalance
@@ -37,6 +38,8 @@ MOST_SQUARED = 9.0
 #: The outline is also looked for from states so many standard deviations off, in so many directions that landmarks tell
 #: least of: from theirs alone it may be led to edges beside it.
 BESIDE, DIRECTIONS = 2.0, 2
+#: Such a state is none if its nodes are no farther off on average than this share of the object's size.
+SAME_SHAPE = 1e-4
 #: Chance by which landmarks of the size of error that they show fit so much worse beside the right outline.
 LEAST_CHANCE = 1e-3
 
@@ -160,7 +163,10 @@ class OutlineSnap:
         values, vectors = np.linalg.eigh(best.covariance / np.outer(box.scale, box.scale))
         steps = BESIDE * np.sqrt(np.maximum(values, 0.0)) * vectors * box.scale[:, None]
         least_seen = steps.T[::-1][:DIRECTIONS]
-        return [box.nearest(moved(best.state, sign * step)) for step in least_seen for sign in (1.0, -1.0)]
+        beside = [box.nearest(moved(best.state, sign * step)) for step in least_seen for sign in (1.0, -1.0)]
+        # A parameter that changes nothing that is seen keeps its value.
+        model = self._estimator.model
+        return [state for state in beside if shape_distance(model, best.state, state) > SAME_SHAPE]
 
     def snapped(self, start: State, by_landmarks: State) -> Snap:
         """What landmarks and outline have together near a state, beside the one that landmarks alone have."""
@@ -236,5 +242,5 @@ class OutlineSnap:
         free = np.append(np.flatnonzero(box.upper > box.lower), np.arange(d, d + 6))
         scale = np.outer(box.scale[free], box.scale[free])
         inverse = np.zeros_like(hessian)
-        inverse[np.ix_(free, free)] = scale * np.linalg.pinv(hessian[np.ix_(free, free)] * scale, hermitian=True)
+        inverse[np.ix_(free, free)] = scale * floored_inverse(hessian[np.ix_(free, free)] * scale)
         return inverse
