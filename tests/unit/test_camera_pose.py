@@ -66,8 +66,22 @@ def test_the_optimum_and_covariance_are_those_of_scipy(points):
     pose = rigid_pose([0.0, 0.0, 0.0], expected.x[:3]) @ TRUTH
     pose[:3, 3] += expected.x[3:]
     assert np.allclose(found.camera_from_world, pose, atol=1e-7)
-    covariance = np.linalg.inv(expected.jac.T @ expected.jac) * (expected.fun**2).mean()
-    assert np.allclose(found.covariance, covariance, rtol=0.02, atol=1e-9)
+    covariance = np.linalg.inv(expected.jac.T @ expected.jac) * (expected.fun**2).sum() / (len(expected.fun) - 6)
+    assert np.allclose(found.covariance, covariance, rtol=0.01, atol=1e-9)
+
+
+def test_the_covariance_of_few_points_is_as_wide_as_the_errors():
+    """Of errors and deviations by 8 points, whose residuals have 10 degrees of freedom: Fisher's F of mean 10 / 8."""
+    rng, squares = np.random.default_rng(0), []
+    for _ in range(300):
+        points = rng.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 4.0], size=(8, 3))
+        pixels = pixels_of(TRUTH, points) + 0.5 * rng.standard_normal((8, 2))
+        found = refine_pose(TRUTH, points, pixels, INTRINSICS, huber_px=10.0, inlier_px=10.0)
+        turn = Rotation.from_matrix(TRUTH[:3, :3] @ found.camera_from_world[:3, :3].T)
+        shift = TRUTH[:3, 3] - turn.apply(found.camera_from_world[:3, 3])
+        away = np.concatenate([turn.as_rotvec(), shift])
+        squares.append(away @ np.linalg.solve(found.covariance, away) / 6.0)
+    assert np.mean(squares) == pytest.approx(1.25, rel=0.2)
 
 
 def test_a_pose_is_found_without_a_start_among_wrong_matches(points):

@@ -189,8 +189,9 @@ def _refine_in_rounds(pose, points, pixels, camera, huber_px, inlier_px, used):
             square += error * error
             n += 1
     rms = math.sqrt(square / n) if n else np.inf
-    # Two residuals a point: the noise of one coordinate is the rms over sqrt(2).
-    return pose, _inverse_of_normal(matrix) * (max(rms, 0.1) ** 2 / 2.0), errors, rms
+    # Two residuals a point, of which the pose takes up six.
+    variance = max(rms, 0.1) ** 2 * n / max(2 * n - 6, 1)
+    return pose, _inverse_of_normal(matrix) * variance, errors, rms
 
 
 @dataclass(frozen=True)
