@@ -22,14 +22,14 @@ def rigid_sheet():
 
 def test_a_print_seen_upside_down_is_where_its_pixels_are():
     # The corners of pixels are those of the print, turned by half a turn: nothing is interpolated.
-    height, width = 300, round(300 * LENGTH / WIDTH)
+    height, width = 180, round(180 * LENGTH / WIDTH)
     texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (height, width), np.uint8), (0, 0), 2.0)
     texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
-    frame = np.full((480, 640), 120, np.uint8)
-    frame[90 : 90 + height, 100 : 100 + width] = texture[::-1, ::-1]
+    frame = np.full((240, 320), 120, np.uint8)
+    frame[20 : 20 + height, 40 : 40 + width] = texture[::-1, ::-1]
     corners = [[-0.5 * LENGTH, 0.5 * WIDTH, 0.0], [LENGTH, 0.0, 0.0], [0.0, -WIDTH, 0.0]]
     initializer = PictureInitializer(texture, np.array(corners), None)
-    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
     found = initializer.register(rigid_sheet(), camera, frame)
     centre = camera.project(found.state.camera_from_object.apply(np.zeros((1, 3))))[0]
-    np.testing.assert_allclose(centre, [99.5 + 0.5 * width, 89.5 + 0.5 * height], atol=0.05)
+    np.testing.assert_allclose(centre, [39.5 + 0.5 * width, 19.5 + 0.5 * height], atol=0.05)
