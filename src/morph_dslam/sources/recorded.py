@@ -134,6 +134,11 @@ class RecordedFrames:
         other._records = [replace(record, timestamp=record.index / fps) for record in self._records]
         return other
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the frames, ascending; some may be missing."""
+        return [record.index for record in self._records]
+
     def __len__(self) -> int:
         return len(self._records)
 

@@ -21,7 +21,9 @@ from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.models import shown_kind
 from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_landmarks, save_landmarks
 from morph_dslam.extend.tracking import State
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.packing import packed
+from morph_dslam.studio.project import part_of
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]
@@ -75,6 +77,16 @@ def camera_facts(path: Path) -> dict[str, Any]:
         "distortion": list(camera.distortion),
         "lens": camera.lens_model,
     }
+
+
+def take_camera(path: Path, target: Path) -> None:
+    """Write the camera of a file, which may be of another program, as a camera file of this one.
+
+    How a file is read depends on its ending, which the target's may not be. Raises CameraError if it cannot be read.
+    """
+    part = part_of(target)
+    save_camera(part, load_camera(path))
+    part.replace(target)
 
 
 def camera_problem(path: Path, width: int, height: int) -> str | None:

@@ -94,27 +94,40 @@ class Jobs:
         if self.job is not None and self.job.running:
             raise StudioError(f"`{self.job.command}` still runs: stop it, or wait until it has ended")
 
-    async def start(self, kind: str, words: list[str]) -> None:
+    async def start(self, kind: str, words: list[str], then: Callable[[], None] = lambda: None) -> None:
         """Run ``morph`` with these words.
+
+        Parameters
+        ----------
+        kind : the command's name, such as "build".
+        words : of the command line.
+        then : called when it has ended well, before the pages are told of it.
 
         Raises
         ------
         StudioError
-            If another command runs.
+            If another command runs, or the system starts none.
         """
         self.check_idle()
-        self.job = Job(kind, shlex.join(["morph", *words]))
+        # A second request must find this one while its process is made.
+        before, self.job = self.job, Job(kind, shlex.join(["morph", *words]))
         self._start = time.monotonic()
-        self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "morph_dslam", *words,
-            cwd=self._folder, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT, start_new_session=True,
-            env=os.environ | {"PYTHONUNBUFFERED": "1", "TQDM_MININTERVAL": "0.1"},
-        )  # fmt: skip
-        self._task = asyncio.create_task(self._follow(self.job, self._process))
+        try:
+            self._process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "morph_dslam", *words,
+                cwd=self._folder, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.STDOUT, start_new_session=True,
+                env=os.environ | {"PYTHONUNBUFFERED": "1", "TQDM_MININTERVAL": "0.1"},
+            )  # fmt: skip
+        except BaseException as error:
+            self.job = before
+            if isinstance(error, OSError):
+                raise StudioError(f"`morph {kind}` cannot be started: {error.strerror or error}") from error
+            raise
+        self._task = asyncio.create_task(self._follow(self.job, self._process, then))
         self._changed()
 
-    async def _follow(self, job: Job, process: asyncio.subprocess.Process) -> None:
+    async def _follow(self, job: Job, process: asyncio.subprocess.Process, then: Callable[[], None]) -> None:
         assert process.stdout is not None
         rest = b""
         while data := await process.stdout.read(1 << 16):
@@ -128,7 +141,11 @@ class Jobs:
             job.take(rest.decode(errors="replace").rstrip())
         job.status = await process.wait()
         job.seconds, job.running = time.monotonic() - self._start, False
-        self._changed()
+        try:
+            if job.status == 0:
+                then()
+        finally:
+            self._changed()
 
     async def stop(self) -> None:
         """Interrupt the command as Ctrl-C does, so that it keeps what it has; nothing if none runs."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from morph_dslam.errors import StudioError
+from morph_dslam.errors import MorphError, StudioError
 from morph_dslam.extend.mechanics import Mesh, check_mesh, load_mesh, save_mesh
 from morph_dslam.extend.studies import file_notes
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.packing import packed
 
 Array = NDArray[np.float64]
+#: Units that a file may be drawn in.
+UNITS = ("mm", "cm", "m", "um")
 Indices = NDArray[np.int64]
 _SET_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,39}")
 _INCLUDE = re.compile(rb"^\s*\*\s*INCLUDE", re.IGNORECASE | re.MULTILINE)
@@ -83,8 +85,25 @@ class _Outside:
         ), np.concatenate([number, fourth])  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _Version:
+    """A file as it stands; one that was moved and not written since is the same.
+
+    Attributes
+    ----------
+    path : of the file.
+    name : of the file, without its folder.
+    seal : inode, time of writing in nanoseconds, and bytes.
+    """
+
+    path: Path = field(compare=False)
+    name: str
+    seal: tuple[int, int, int]
+
+
 @lru_cache(maxsize=2)
-def _outside(path: Path, unit: str, size: float | None, stamp: tuple[int, int]) -> _Outside:
+def _outside(version: _Version, unit: str, size: float | None) -> _Outside:
+    path = version.path
     if file_kind(path) == ".inp" and _INCLUDE.search(path.read_bytes()):
         raise StudioError(f"{path.name} includes other files: write one flat file")
     mesh = load_mesh(path, unit, size)
@@ -101,7 +120,26 @@ def _opened(path: Path, unit: str, size: float | None) -> _Outside:
     if not path.is_file():
         raise StudioError(f"{path.name} is not in the project: upload it as an object first")
     found = path.stat()
-    return _outside(path, unit, size, (found.st_mtime_ns, found.st_size))
+    return _outside(_Version(path, path.name, (found.st_ino, found.st_mtime_ns, found.st_size)), unit, size)
+
+
+def check_object(path: Path, unit: str) -> None:
+    """Raise an error if a mesh file cannot be read as an object in any unit.
+
+    Parameters
+    ----------
+    path : mesh file.
+    unit : that it is read in first; by another one its size may be plausible.
+    """
+    refusal: MorphError | None = None
+    for one in dict.fromkeys((unit, *UNITS)):
+        try:
+            _opened(path, one, None)
+            return
+        except MorphError as error:
+            refusal = refusal or error
+    if refusal is not None:
+        raise refusal
 
 
 def object_surface(path: Path, unit: str, size: float | None) -> bytes:

@@ -16,6 +16,7 @@ from PIL import ExifTags, Image
 
 from morph_dslam import Frame, open_source
 from morph_dslam.errors import StudioError
+from morph_dslam.sources.recorded import RecordedFrames
 from morph_dslam.studio.clicks import stamp
 
 _JPEG_QUALITY = 88
@@ -37,6 +38,9 @@ class _Recording:
         self._kept: dict[int, bytes] = {}
         first = next(iter(source))
         self.first, (self.height, self.width) = first.index, first.image.shape[:2]
+        self.numbers = (
+            source.numbers if isinstance(source, RecordedFrames) else range(self.first, self.first + self.count)
+        )
 
     def jpeg(self, number: int) -> bytes:
         """A frame as JPEG."""
@@ -67,14 +71,28 @@ def _recording(path: Path, seal: tuple) -> _Recording:
 
 
 def _opened(path: Path) -> _Recording:
+    # Any image of a folder may have been replaced.
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return _recording(path, (len(files), *(stamp(file) for file in files[-1:])))
+    return _recording(path, tuple((file.name, *stamp(file)) for file in files))
 
 
 def recording_facts(path: Path) -> dict[str, Any]:
-    """Size, number of frames, number of the first one, and rate of a recording."""
+    """Size, number of frames, numbers of the first and the last one, and rate of a recording."""
     found = _opened(path)
-    return {"width": found.width, "height": found.height, "frames": found.count, "first": found.first, "fps": found.fps}
+    return {
+        "width": found.width,
+        "height": found.height,
+        "frames": found.count,
+        "first": found.first,
+        "last": found.numbers[-1],
+        "fps": found.fps,
+    }
+
+
+def frame_numbers(path: Path) -> list[int] | None:
+    """Numbers of the frames of a recording, ascending; None where each number from the first to the last is there."""
+    numbers = _opened(path).numbers
+    return None if numbers[-1] - numbers[0] + 1 == len(numbers) else list(numbers)
 
 
 def frame_jpeg(path: Path, number: int) -> bytes:

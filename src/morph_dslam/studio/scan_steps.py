@@ -12,7 +12,7 @@ from pydantic import Field
 from morph_dslam.errors import StudioError
 from morph_dslam.studio import places, project as names, recording
 from morph_dslam.studio.clicks import camera_facts
-from morph_dslam.studio.jobs import Jobs
+from morph_dslam.studio.jobs import Job, Jobs
 from morph_dslam.studio.project import Project
 from morph_dslam.studio.worker import Worker
 
@@ -40,6 +40,7 @@ class ScanSteps:
 
     def __init__(self, project: Project, worker: Worker, jobs: Jobs) -> None:
         self._project, self._worker, self._jobs = project, worker, jobs
+        self._discarded: Job | None = None
         self.actions: dict[str, Callable[..., Awaitable[Any]]] = {
             "start_by": self.start_by,
             "scan": self.scan,
@@ -82,6 +83,16 @@ class ScanSteps:
         """Take a recording of its own as the scan."""
         self._forget_map()
         self._project.choose(scan=name)
+
+    def recording_replaced(self, name: str) -> None:
+        """Forget the map of the recording that had this name: its keyframes are no frames of the new one."""
+        if self._project.choices.get("mapped") == name:
+            self._forget_map()
+
+    def job_ended(self) -> None:
+        """Forget what a command wrote whose scan was replaced while it ran."""
+        if self._discarded is not None and not self._discarded.running:
+            self._forget_map()
 
     async def scan_the_recording(self) -> dict[str, Any]:
         """Take the recording that is tracked as the scan, too."""
@@ -164,6 +175,9 @@ class ScanSteps:
         return {}
 
     def _forget_map(self) -> None:
+        job = self._jobs.job
+        is_made = job is not None and job.running and job.kind in ("slam", "register")
+        self._discarded = job if is_made else None
         self._forget_place()
         self._project.path(_MAP_SUMMARY).unlink(missing_ok=True)
         self._project.choose(mapped=None)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from morph_dslam.errors import StudioError
+from morph_dslam.io.text import read_text
 from morph_dslam.studio import clicks, object_mesh, project as names, recording, run_files, study_file
 from morph_dslam.studio.jobs import Job, Jobs
 from morph_dslam.studio.live_steps import LiveSteps
@@ -24,7 +25,7 @@ _LOOK = 0.25
 #: Unit of the mesh that the studio writes.
 _UNIT = "mm"
 Unit = Literal["m", "cm", "mm", "um"]
-Name = Annotated[str, Field(min_length=1, max_length=80)]
+Name = Annotated[str, Field(min_length=1, max_length=100)]
 Pairs = list[list[float]]
 #: How uploads are looked at before they take the place of a file of the same name.
 _CHECKS: dict[str, Callable[[Path], Any]] = {
@@ -62,13 +63,14 @@ class Steps:
             for name in (
                 "load_object", "grow", "name_set", "forget_set", "study", "write_study", "change_study", "forms",
                 "model", "build", "stop", "calibrate", "guess_camera", "start_files", "model_mesh", "fit", "save_start",
-                "track", "tracked_frames", "overlay", "export", "forget_frames",
+                "track", "tracked_frames", "overlay", "export", "forget_frames", "frame_numbers",
             )
         }  # fmt: skip
         self.actions |= self.live.actions
         self.actions |= self.scan.actions
 
     def _tell(self) -> None:
+        self.scan.job_ended()
         if self._reads_earlier is not None and not self._reads_earlier[0].running:
             (_, name), self._reads_earlier = self._reads_earlier, None
             self._outdate_run_of(name)  # what it was tracked in was replaced meanwhile
@@ -100,7 +102,7 @@ class Steps:
         is_tracked = has(f"{names.RUN}/summary.json") and problem is None
         done = {
             "object": has(names.MESH),
-            "study": has(names.STUDY) and not (await self.study())["problems"],
+            "study": has(names.STUDY) and await self._is_study_good(),
             "build": has(names.MODEL),
             "camera": has(names.CAMERA) and self.project.recording is not None and wrong_camera is None,
             "start": self.scan.is_accepted if self.scan.is_chosen else has(names.LANDMARKS) and wrong_start is None,
@@ -164,13 +166,13 @@ class Steps:
         """
         project = self.project
         path, _ = project.upload_path(kind, name)
-        if kind in _CHECKS:
-            await self._check_upload(kind, part, path)
+        await self._check_upload(kind, part, path)
         replaces = path.exists() and not await asyncio.to_thread(filecmp.cmp, part, path, shallow=False)
         path.parent.mkdir(exist_ok=True)
         part.replace(path)
         if kind == "camera":
-            project.write(names.CAMERA, path.read_text()) if path.name != names.CAMERA else None
+            if path.name != names.CAMERA:
+                await self._worker.call(clicks.take_camera, path, project.path(names.CAMERA))
             project.choose(camera_from=name, camera_note=None)
         elif kind == "landmarks":
             project.write(names.LANDMARKS, path.read_text()) if path.name != names.LANDMARKS else None
@@ -178,7 +180,7 @@ class Steps:
             project.choose(pairs_were_of=None, at_rest=None)
         elif kind == "scan":
             self.scan.uploaded(name)
-        elif kind == "object":
+        elif kind == "object" and replaces and project.choices.get("object") == name:
             project.choose(object=None, sets=None)
         elif kind in ("recording", "frame"):
             self._take_recording(name if kind == "recording" else names.FRAMES, replaces)
@@ -187,7 +189,10 @@ class Steps:
 
     async def _check_upload(self, kind: str, part: Path, path: Path) -> None:
         try:
-            await self._worker.call(_CHECKS[kind], part)
+            if kind == "object":
+                await self._worker.call(object_mesh.check_object, part, self.project.choices.get("unit", _UNIT))
+            elif kind in _CHECKS:
+                await self._worker.call(_CHECKS[kind], part)
         except StudioError as error:
             kept = f"; the {path.name} that was there before is kept" if path.exists() else ""
             raise StudioError(f"{str(error).replace(str(part), path.name)}{kept}") from error
@@ -195,10 +200,14 @@ class Steps:
     def _take_recording(self, name: str, replaces: bool) -> None:
         """Track another recording, or the same one if nothing of it was replaced."""
         if replaces:
-            self._outdate_run_of(name)
+            self._outdate(name)
         if replaces or self.project.choices.get("recording") != name:
             self.project.take_recording(name, is_another=replaces)
             self.recording_came()
+
+    def _outdate(self, name: str) -> None:
+        self._outdate_run_of(name)
+        self.scan.recording_replaced(name)
 
     def _outdate_run_of(self, name: str) -> None:
         """What has this name is replaced: a run of it, also one that is still tracked, is of what was there before."""
@@ -213,7 +222,7 @@ class Steps:
         path = self.project.path(folder)
         files = list(path.iterdir()) if path.is_dir() else []
         if files and folder == names.FRAMES:
-            self._outdate_run_of(folder)
+            self._outdate(folder)
             if self.project.choices.get("recording") == folder:
                 self.project.set_aside_pairs()
                 self.recording_came()
@@ -276,6 +285,12 @@ class Steps:
         """The study file, and what is wrong with it."""
         return await self._worker.call(study_file.study_state, self.project.path(names.STUDY))
 
+    async def _is_study_good(self) -> bool:
+        try:
+            return not (await self.study())["problems"]
+        except StudioError:  # it takes too long to be read, which is said where it is opened
+            return False
+
     async def write_study(self, text: str) -> dict[str, Any]:
         """Write the study file as it was typed; one that is not TOML is not written."""
         await self._worker.call(study_file.check_text, text)
@@ -285,7 +300,7 @@ class Steps:
     async def change_study(self, section: Name, key: str | int | None = None, value: Any = None) -> dict[str, Any]:
         """Change one entry of the study file; without a value it is taken out."""
         path = self.project.path(names.STUDY)
-        text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        text = read_text(path, "study", StudioError) if path.is_file() else ""
         return await self.write_study(await self._worker.call(study_file.changed_text, text, section, key, value))
 
     async def forms(self) -> dict[str, Any]:
@@ -331,6 +346,10 @@ class Steps:
         """A frame of the recording."""
         return await self._worker.call(recording.frame_jpeg, self._recording(), number)
 
+    async def frame_numbers(self) -> dict[str, Any]:
+        """Numbers of the recording's frames, null where none is missing between the first and the last."""
+        return {"numbers": await self._worker.call(recording.frame_numbers, self._recording())}
+
     async def _camera_problem(self) -> str | None:
         """Why the camera file is not that of the recording; None if it may be, or if either is not there."""
         name = self.project.recording
@@ -364,8 +383,10 @@ class Steps:
         if not self.project.has(names.BOARD):
             raise StudioError("drop pictures of the board first")
         words = ["calibrate", names.BOARD, f"--board={board}", f"--square={square}", f"--lens={lens}"]
-        await self._jobs.start("calibrate", [*words, "-o", names.CAMERA])
-        self.project.choose(camera_from=names.BOARD, camera_note=None)
+        words += ["-o", names.CAMERA]
+        await self._jobs.start(
+            "calibrate", words, lambda: self.project.choose(camera_from=names.BOARD, camera_note=None)
+        )
         return {}
 
     # -- start -------------------------------------------------------------------------------------
