@@ -6,6 +6,7 @@ These functions run in the worker process.
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 import warnings
 from collections.abc import Sequence
@@ -14,11 +15,14 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Array, InlineTable, Table
 
 from morph_dslam import make_study
 from morph_dslam.errors import MorphError, StudioError
 from morph_dslam.extend.mechanics import constant_quantities, laws, material_catalogue
 from morph_dslam.extend.studies import SolidStudy, study_warnings
+from morph_dslam.io.text import read_text
 
 #: Characters of a study file.
 LONGEST_TEXT = 500_000
@@ -34,7 +38,7 @@ def check_text(text: str) -> dict[str, Any]:
     Raises
     ------
     StudioError
-        If it is too long, is not TOML, or names a file outside of the project.
+        If it is too long, is not TOML, has a number that is not finite, or names a file outside of the project.
     """
     if len(text) > LONGEST_TEXT:
         raise StudioError(f"the study has {len(text)} characters; {LONGEST_TEXT} are the most")
@@ -42,18 +46,20 @@ def check_text(text: str) -> dict[str, Any]:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise StudioError(f"the study is not TOML: {error}") from error
-    _check_inside(content)
+    _check_values(content)
     return content
 
 
-def _check_inside(value: Any) -> None:
-    """Refuse texts that name a file outside of the study's folder; values such as "3 N/mm2" name none."""
+def _check_values(value: Any) -> None:
+    """Refuse numbers that are not finite, and texts that name a file outside; values such as "3 N/mm2" name none."""
     if isinstance(value, dict):
         for part in value.values():
-            _check_inside(part)
+            _check_values(part)
     elif isinstance(value, list):
         for part in value:
-            _check_inside(part)
+            _check_values(part)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise StudioError(f"{value} is no value that a study can have: give a finite number")
     elif isinstance(value, str):
         posix, windows = PurePosixPath(value), PureWindowsPath(value)
         if posix.is_absolute() or windows.is_absolute() or ".." in {*posix.parts, *windows.parts} or "~" in value[:1]:
@@ -68,10 +74,13 @@ def study_state(path: Path) -> dict[str, Any]:
     ``text``; ``content``, or None where it is not TOML; ``problems``, why `morph build` would refuse it; ``warnings``,
     what loading it says; ``sets`` of its mesh.
     """
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    state: dict[str, Any] = {"text": text, "content": None, "problems": [], "warnings": [], "sets": [], "cell_sets": []}
+    state: dict[str, Any] = {"text": "", "content": None, "problems": [], "warnings": [], "sets": [], "cell_sets": []}
     try:
-        content = check_text(text)
+        if path.is_file():
+            # What can be shown of one in another encoding can be mended and saved.
+            state["text"] = path.read_bytes().decode(errors="replace")
+            state["text"] = read_text(path, "study", StudioError)
+        content = check_text(state["text"])
         state["content"] = json.loads(json.dumps(content, default=str))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -82,6 +91,8 @@ def study_state(path: Path) -> dict[str, Any]:
                 state["cell_sets"] = sorted(mesh.cell_sets)
                 state["problems"] = _unused(study)
             state["warnings"] = [*study_warnings(study), *(str(warning.message) for warning in caught)]
+    except OSError as error:
+        state["problems"] = [f"{path.name} cannot be read ({error.strerror or error})"]
     except MorphError as error:
         state["problems"] = [str(error).removeprefix("the study: ")]
     return state
@@ -105,42 +116,95 @@ def changed_text(text: str, section: str, key: str | int | None, value: Any) -> 
     Raises
     ------
     StudioError
-        If there is no such section, or the text is not TOML.
+        If there is no such section, the text is not TOML, or is written in a way that a form cannot change.
     """
-    check_text(text)
+    content = check_text(text)
     document = tomlkit.parse(text)
     if section in _NAMED and isinstance(key, str):
-        table = document.setdefault(section, tomlkit.table(is_super_table=True))
-        _replace(table, key, value)
+        wanted = content | {section: _without_none(content.get(section, {}) | {key: value})}
+        change = _change_named
     elif section in _LISTED and isinstance(key, int):
-        _replace_listed(document, section, key, value)
+        entries = list(content.get(section, []))
+        if not 0 <= key < len(entries) + (value is not None):
+            raise StudioError(f"{section} has {len(entries)} entries, so none at {key}")
+        entries[key : key + 1] = [] if value is None else [value]
+        wanted, change = content | {section: entries}, _change_listed
     elif section in _SINGLE and key is None:
-        _replace(document, section, value)
+        wanted, change = content | {section: value}, _change_single
     else:
         raise StudioError(f"{section!r:.40} with the key {key!r:.40} is no section of a study that a form changes")
-    if section in document and not document[section]:
-        document.remove(section)
-    return tomlkit.dumps(document)
+    wanted = {name: part for name, part in wanted.items() if name != section or part}
+    try:
+        change(document, section, key, value)
+        if section in document and not document[section]:
+            document.remove(section)
+        changed = tomlkit.dumps(document)
+        is_right = tomllib.loads(changed) == wanted
+    except (TOMLKitError, ValueError, TypeError, LookupError, AttributeError):
+        is_right, changed = False, ""
+    if not is_right:
+        raise StudioError(f"a form cannot change {section} as it is written here: change the text")
+    return changed
 
 
-def _replace(table: Any, key: str, value: Any) -> None:
+def _without_none(table: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in table.items() if value is not None}
+
+
+def _change_named(document: Any, section: str, key: Any, value: Any) -> None:
+    if section not in document:
+        document[section] = tomlkit.table(is_super_table=True)
+    _change(document[section], key, value)
+
+
+def _change_listed(document: Any, section: str, key: Any, value: Any) -> None:
+    if section not in document:
+        document[section] = tomlkit.aot()
+    entries = document[section]
+    if value is None:
+        del entries[key]
+    elif key < len(entries):
+        _fill(entries[key], value)
+    else:
+        entries.append(_table(value, isinstance(entries, Array)))
+
+
+def _change_single(document: Any, section: str, key: Any, value: Any) -> None:
+    _change(document, section, value)
+
+
+def _change(table: Any, key: str, value: Any) -> None:
+    """Set an entry of a table; tables are filled anew entry by entry, so that remarks in them stay."""
     if value is None:
         table.pop(key, None)
+    elif not isinstance(value, dict):
+        if key not in table or table[key] != value:
+            table[key] = value
+    elif isinstance(table.get(key), dict):
+        _fill(table[key], value)
     else:
-        table[key] = tomlkit.item(value)
+        table[key] = _table(value, isinstance(table, InlineTable))
 
 
-def _replace_listed(document: Any, section: str, position: int, value: Any) -> None:
-    entries = list(document.get(section, []))
-    if not 0 <= position <= len(entries):
-        raise StudioError(f"{section} has {len(entries)} entries, so none at {position}")
-    new = [] if value is None else [tomlkit.item(value)]
-    array = tomlkit.aot()
-    for entry in [*entries[:position], *new, *entries[position + 1 :]]:
-        array.append(entry)
-    document.pop(section, None)
-    if len(array):
-        document[section] = array
+def _fill(table: Any, value: dict[str, Any]) -> None:
+    for key in [key for key in table if key not in value]:
+        table.pop(key)
+    # Remarks at the end of a table stand before what follows it: new entries come before them.
+    body = table.value.body if isinstance(table, Table) else []
+    end = len(body)
+    while end and body[end - 1][0] is None:
+        end -= 1
+    last = body[end:]
+    del body[end:]
+    for key, part in value.items():
+        _change(table, key, part)
+    body.extend(last)
+
+
+def _table(value: dict[str, Any], is_inline: bool) -> Any:
+    table = tomlkit.inline_table() if is_inline else tomlkit.table()
+    _fill(table, value)
+    return table
 
 
 @cache
