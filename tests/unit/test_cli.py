@@ -7,11 +7,12 @@ import subprocess
 import sys
 import time
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.cli.arguments import frame_range
+from morph_dslam.cli.arguments import file_and_column, frame_range
 from morph_dslam.cli.track import print_summary
 from morph_dslam.errors import StreamError, StudyError
 from morph_dslam.model import save_model
@@ -283,3 +284,18 @@ def test_progress_in_a_log_is_a_line_in_ten_seconds():
             [sys.executable, "-c", code], capture_output=True, text=True, env=known | given, check=True
         )
         assert float(run.stdout) == interval
+
+
+def test_a_column_is_told_from_a_path_by_the_file_that_is_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("run_12:30:00.csv", "curve.csv"):
+        Path(name).touch()
+    for text, found in (
+        ("run_12:30:00.csv", ("run_12:30:00.csv", None)),
+        ("run_12:30:00.csv:force_N", ("run_12:30:00.csv", "force_N")),
+        ("curve.csv:force [N/mm]", ("curve.csv", "force [N/mm]")),
+        ("curve.csv:a:b", ("curve.csv", "a:b")),
+        ("none.csv:force", ("none.csv", "force")),
+        ("C:\\curve.csv", ("C:\\curve.csv", None)),
+    ):
+        assert file_and_column(text) == (Path(found[0]), found[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,12 @@ def named_place(text: str) -> tuple[str, tuple[float, float, float]]:
 
 def file_and_column(text: str) -> tuple[Path, str | None]:
     """A path, and the column after a colon: "curve.csv", "curve.csv:force_N"; "C:\\curve.csv" is a path."""
+    if Path(text).exists():
+        return Path(text), None
+    for colon in re.finditer(":", text):  # names of files and of columns may have some of their own
+        name, column = text[: colon.start()], text[colon.end() :]
+        if Path(name).is_file():
+            return Path(name), column
     name, colon, column = text.rpartition(":")
     if colon and not set(column) & set("/\\"):
         return Path(name), column

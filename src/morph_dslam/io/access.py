@@ -34,7 +34,9 @@ class ServerNames:
     """
 
     def __init__(self, names: Iterable[str] = (), any_address: bool = False) -> None:
-        self._names, self._any_address = {HOST, "localhost", *names}, any_address
+        # Browsers ask in lower case, whatever case the computer's own name is in.
+        self._names = {name.lower() for name in (HOST, "localhost", *names)}
+        self._any_address = any_address
 
     def refusal(self, host: str, origin: str | None, scheme: str = "http") -> str | None:
         """Why a request is refused; None if it is not.

@@ -7,6 +7,9 @@ folder. These functions run in the worker process, `FrameLog` and `run_of` besid
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,8 @@ from morph_dslam.studio.clicks import opened_model, overlay, stamp
 _LIVE_SOCKET = "camera.sock"
 #: Largest difference of two models that are the same, a share of the object's size: a build adds up in any order.
 _SAME = 1e-5
+#: Frames that pages are told at once.
+_MOST_FRAMES = 1000
 _RESULT, _MODEL, _CAMERA = "result.h5", "model.morph", "camera.yaml"
 
 
@@ -38,11 +43,11 @@ class FrameLog:
         self._path, self._stamp = path, (0, 0)
         self._offset, self._last = 0, b""
 
-    def new(self) -> dict[str, Any] | None:
-        """Whole lines that have come since the last call: ``frames``, and whether the file was begun ``anew``."""
+    def new(self) -> list[dict[str, Any]]:
+        """Whole lines that came since the last call, in parts: ``frames``, and whether the file begins ``anew``."""
         now = stamp(self._path)
         if now == self._stamp:
-            return None
+            return []
         self._stamp = now
         was_read = self._offset > 0
         try:
@@ -52,10 +57,12 @@ class FrameLog:
         text = text[: text.rfind(b"\n") + 1]
         anew = self._offset == 0 and (was_read or bool(text))
         if not text and not anew:
-            return None
+            return []
         lines = text.splitlines(keepends=True)
         self._offset, self._last = self._offset + len(text), lines[-1] if lines else b""
-        return {"anew": anew, "frames": [json.loads(line) for line in lines]}
+        frames = _rows(lines)
+        parts = [frames[k : k + _MOST_FRAMES] for k in range(0, len(frames), _MOST_FRAMES)] or [[]]
+        return [{"anew": anew and k == 0, "frames": part} for k, part in enumerate(parts)]
 
     def _is_another(self) -> bool:
         """Whether the file no longer holds what was read of it last; it is then read from its beginning."""
@@ -70,6 +77,37 @@ class FrameLog:
         with self._path.open("rb") as file:
             file.seek(self._offset)
             return file.read()
+
+
+def _rows(lines: Iterable[bytes]) -> list[dict[str, Any]]:
+    """The frames of lines of a frame log; lines that are damaged have none."""
+    rows = []
+    for line in lines:
+        with suppress(ValueError, RecursionError):
+            row = json.loads(line)
+            if isinstance(row, dict) and "frame" in row:
+                rows.append(row)
+    return rows
+
+
+def logged_frames(log: Path) -> list[dict[str, Any]]:
+    """The frames of a frame log, none where there is no log."""
+    return _rows(log.read_bytes().splitlines()) if log.is_file() else []
+
+
+def log_overlay(log: Path, model: Path, camera: Path, frame: int) -> bytes:
+    """The model over a frame of a frame log; see `overlay`.
+
+    Raises
+    ------
+    StudioError
+        If the object was not tracked in the frame.
+    """
+    # The others of a long log would take seconds to be read.
+    named = re.compile(rb'"frame": *%d\b' % frame)
+    lines = log.read_bytes().splitlines() if log.is_file() else []
+    rows = _rows(line for line in lines if named.search(line))
+    return _row_overlay(model, camera, next((row for row in rows if row["frame"] == frame), None), frame)
 
 
 def clear_broken_log(path: Path) -> None:
@@ -181,10 +219,10 @@ def run_overlay(run: Path, model: Path, camera: Path, frame: int) -> bytes:
         If the object was not tracked in the frame.
     """
     own = run / _CAMERA
-    return row_overlay(model, own if own.is_file() else camera, _frames_of(run).get(frame), frame)
+    return _row_overlay(model, own if own.is_file() else camera, _frames_of(run).get(frame), frame)
 
 
-def row_overlay(model: Path, camera: Path, row: dict[str, Any] | None, frame: int) -> bytes:
+def _row_overlay(model: Path, camera: Path, row: dict[str, Any] | None, frame: int) -> bytes:
     """The model over a frame, by its row of a frame log."""
     if row is None or row["camera_from_object"] is None or None in row["parameters"].values():
         raise StudioError(f"the object was not tracked in frame {frame}")

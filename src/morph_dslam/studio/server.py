@@ -76,7 +76,7 @@ class StudioServer:
             timeout_graceful_shutdown=2,
         )  # fmt: skip
         self._server = _Server(config, steps)
-        shown = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        shown = socket.gethostname() if host in ("0.0.0.0", "::") else _in_address(host)
         self.address = f"http://{shown}:{self.port}/?token={self.token}"
         (project.folder / _OPEN_AT).write_text(self.address.partition("?")[0] + "\n")
 
@@ -153,12 +153,18 @@ def _keep_others_out(opened: ExitStack, project: Project) -> None:
         shutil.rmtree(left, ignore_errors=True)
 
 
+def _in_address(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
 def _listening(host: str, port: int) -> socket.socket:
     try:
-        listening = socket.create_server((host, port), backlog=64)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listening = socket.create_server((host, port), family=family, backlog=64)
     except (OSError, OverflowError) as error:
         raise StudioError(
-            f"{host}:{port} cannot be taken ({error}); choose another with --port; --port 0 takes any free one"
+            f"{_in_address(host)}:{port} cannot be taken ({error}); choose another with --port; --port 0 takes any "
+            "free one"
         ) from error
     return listening
 

@@ -136,7 +136,8 @@ class Steps:
 
     async def news(self) -> AsyncIterator[tuple[str, Any]]:
         """The job at each change, and the lines of the frame log as they come, until the studio ends."""
-        told, log, arrivals = None, run_files.FrameLog(self.project.path(names.FRAME_LOG)), self._arrivals
+        phone = self.phone_address()
+        told, log, arrivals = None, run_files.FrameLog(self._log), self._arrivals
         while not self._ended:
             job = self._jobs.content()
             if job != told:
@@ -145,8 +146,10 @@ class Steps:
             if self._arrivals != arrivals:
                 arrivals = self._arrivals
                 yield "recording", self.project.recording
-            lines = log.new()
-            if lines is not None:
+            if self.phone_address() != phone:
+                phone = self.phone_address()
+                yield "phone", phone
+            for lines in await asyncio.to_thread(log.new):
                 yield "frames", lines
             self._changed.clear()
             try:
@@ -445,7 +448,7 @@ class Steps:
         words += self.scan.track_words() if self.scan.is_chosen else self._pairs_words(refine, snap)
         words += ["--outline"] if outline else []
         words += ["--frame-log", names.FRAME_LOG, "--overwrite", "-o", names.RUN]
-        run_files.clear_broken_log(self.project.path(names.FRAME_LOG))
+        run_files.clear_broken_log(self._log)
         await self._jobs.start("track", words)
         return {}
 
@@ -487,12 +490,12 @@ class Steps:
         run = self.project.path(names.RUN)
         frames = await self._worker.call(run_files.run_frames, run)
         summary = await self._worker.call(run_files.run_summary, run)
-        frames = self._logged_frames() if frames is None else frames
+        frames = await self._worker.call(run_files.logged_frames, self._log) if frames is None else frames
         return {"frames": frames, "summary": summary, "problem": await self._run_problem()}
 
-    def _logged_frames(self) -> list[dict[str, Any]]:
-        lines = run_files.FrameLog(self.project.path(names.FRAME_LOG)).new()
-        return [] if lines is None else lines["frames"]
+    @property
+    def _log(self) -> Path:
+        return self.project.path(names.FRAME_LOG)
 
     async def overlay(self, frame: int, of: Literal["run", "log"] = "run") -> bytes:
         """The model over a frame of the run, or of the frame log, which has those that are being tracked."""
@@ -505,8 +508,7 @@ class Steps:
         run = self.project.path(names.RUN)
         if of == "run" and (run / "result.h5").is_file():
             return await self._worker.call(run_files.run_overlay, run, model, camera, frame)
-        row = next((row for row in self._logged_frames() if row["frame"] == frame), None)
-        return await self._worker.call(run_files.row_overlay, model, camera, row, frame)
+        return await self._worker.call(run_files.log_overlay, self._log, model, camera, frame)
 
     async def export(self, format: Literal["vtu", "xdmf", "gltf"]) -> dict[str, Any]:
         """Start `morph export` of the tracked states."""
