@@ -5,7 +5,7 @@ import { ColourBar } from './colour_bar.js';
 
 const TYPES = { '<f4': Float32Array, '<i4': Int32Array };
 const element = (id) => document.getElementById(id);
-let scene = null, view = null, chosen = 0, state = null, received = 0, firstNumber = 0;
+let scene = null, view = null, chosen = 0, received = 0, firstNumber = 0;
 
 // The head of a message, with its arrays by name.
 function unpack(buffer) {
@@ -78,7 +78,7 @@ function showFrame(message) {
   if (!received) firstNumber = message.number;
   received += 1;
   const object = scene.objects[chosen], { name, scalar } = object;
-  state = message.objects[chosen];
+  const state = message.objects[chosen];
   element('status').textContent = state.status === 'tracked' ? `tracked: ${state.text}` : state.text;
   element('status').className = state.status;
   fill('parameters', object.parameters.map((one, i) => [

@@ -76,12 +76,18 @@ export async function cameraStep(app) {
 
   async function refresh() { await app.refresh(); await draw(); }
 
-  async function draw() {
+  // The address of a phone works once, then it is another one.
+  function drawPhone() {
     const { state } = app;
     phone.replaceChildren(...there([state.phone && el('div', { className: 'box' },
       el('p', {}, 'Record with a phone, or let it be the live camera: scan the code, or open the address there. It works once, and the browser warns of the certificate.'),
-      el('img', { id: 'phone-code', src: `/api/phone.png#${Date.now()}`, alt: 'QR code' }),
+      el('img', { id: 'phone-code', src: `/api/phone.png?${Date.now()}`, alt: 'QR code' }),
       el('p', { className: 'mono', id: 'phone-address' }, state.phone))]));
+  }
+
+  async function draw() {
+    const { state } = app;
+    drawPhone();
     const found = state.recording;
     recording.replaceChildren();
     if (found?.message) recording.append(el('p', { className: 'problem' }, found.message));
@@ -111,6 +117,7 @@ export async function cameraStep(app) {
   return {
     close: () => [record, recordBoard, live].forEach((one) => one.close()),
     recording: draw,
+    phone: drawPhone,
     job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); },
   };
 }

@@ -8,6 +8,7 @@ const MOST_KNOWN = 300; // frames whose times are kept
 const QUALITY = 0.9;
 const WINDOW = 2000; // milliseconds over which figures are taken
 const REPLACED = 4000; // how the studio closes the connection of a camera whose place another one takes
+const TOO_LARGE = 1009; // how it closes that of a camera whose frame has too many bytes
 
 // A WebSocket of the page's own server.
 export function openSocket(path) {
@@ -22,8 +23,8 @@ export async function pictureOf(message) {
 }
 
 export class LiveCamera {
-  // told: called with facts of the studio, and with { problem }; picture: with each bitmap; ended: when it is over.
-  constructor({ told, picture = () => {}, ended = () => {} }) {
+  // told: called with facts of the studio, and with { problem }; picture: with each bitmap, which it closes; ended: when it is over.
+  constructor({ told, picture = (bitmap) => bitmap.close(), ended = () => {} }) {
     Object.assign(this, { told, picture, ended });
     this.video = el('video', { className: 'seen', muted: true, playsInline: true });
     this.canvas = document.createElement('canvas');
@@ -42,7 +43,10 @@ export class LiveCamera {
       this.stream = await navigator.mediaDevices.getUserMedia({
         video: { ...sized(size), facingMode: { ideal: 'environment' } }, audio: false,
       });
-      if (!this.running) throw new Error('the camera was stopped');
+      if (!this.running) { // while the browser asked
+        this.stream.getTracks().forEach((track) => track.stop());
+        throw new Error('the camera was stopped');
+      }
       this.video.srcObject = this.stream;
       await this.video.play();
     } catch (error) {
@@ -78,6 +82,11 @@ export class LiveCamera {
     });
     this.socket.addEventListener('close', ({ code, reason }) => {
       if (!this.running) return;
+      if (code === TOO_LARGE) {
+        this.told({ problem: `The studio takes no frames as large as those of this camera: choose a smaller size (${reason}).` });
+        this.stop();
+        return;
+      }
       if (code === REPLACED || !this.stream) {
         this.told({ problem: reason || 'the studio refused the camera: open its address anew' });
         lost(new Error('the studio refused the camera: open its address anew'));

@@ -21,8 +21,9 @@ export async function objectStep(app) {
     ...title('Object', 'Drop the mesh or the CAD surface of the undeformed object.'),
     dropZone('drop-object', 'Drop a mesh file, or click', 'STL, OBJ, PLY, STEP, INP, MSH, VTK, VTU', KINDS,
       ([file]) => app.doing(async () => {
-        chosen.object = await upload('object', file);
-        size.value = '';
+        const name = await upload('object', file);
+        if (name !== chosen.object) size.value = '';
+        chosen.object = name;
         await load();
       })),
     place,
@@ -38,6 +39,7 @@ export async function objectStep(app) {
     const container = el('div', { className: 'fill', id: 'object-view' });
     app.view.replaceChildren(container, el('p', { className: 'hint' },
       'Click a face to pick what belongs to it. Shift adds, drag turns, wheel zooms, right button shifts.'));
+    view?.dispose();
     view = new MeshView(container, surface.nodes, surface.triangles, surface.faces, pick);
     container.view = view;
     draw();
@@ -112,5 +114,5 @@ export async function objectStep(app) {
   unit.addEventListener('change', () => app.doing(load));
   size.addEventListener('change', () => app.doing(load));
   if (chosen.object) await load();
-  return {};
+  return { close: () => view?.dispose() };
 }

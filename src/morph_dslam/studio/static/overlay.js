@@ -1,5 +1,7 @@
 // An image with the model drawn over it. Wheel zooms, dragging shifts, a click tells its pixel.
 
+import { digits } from './parts.js';
+
 const MOST_MOVED = 4;
 
 export class ImageView {
@@ -13,6 +15,7 @@ export class ImageView {
     this.opacity = 0.75;
     let start = null;
     this.canvas.addEventListener('pointerdown', (event) => {
+      if (event.button !== 0) return;
       start = { x: event.clientX, y: event.clientY, left: this.left, top: this.top, moved: 0 };
       this.canvas.setPointerCapture(event.pointerId);
     });
@@ -35,6 +38,7 @@ export class ImageView {
       }
       start = null;
     });
+    this.canvas.addEventListener('pointercancel', () => { start = null; });
     this.canvas.addEventListener('wheel', (event) => {
       event.preventDefault();
       const { left, top } = this.canvas.getBoundingClientRect();
@@ -61,6 +65,7 @@ export class ImageView {
 
   setImage(image) {
     const isNew = !this.image || this.image.width !== image.width || this.image.height !== image.height;
+    if (this.image !== image) this.image?.close?.();
     this.image = image;
     if (isNew) this.fit();
     this.draw();
@@ -151,6 +156,6 @@ export function colourBar(colours, overlay) {
   const gradient = document.createElement('i');
   gradient.style.background = `linear-gradient(90deg, ${stops.join(', ')})`;
   const words = overlay.unit === 'mm' ? 'displacement' : 'von Mises stress';
-  bar.append(`${words}  0`, gradient, `${overlay.top} ${overlay.unit}`);
+  bar.append(`${words}  0`, gradient, `${digits(overlay.top)} ${overlay.unit}`);
   return bar;
 }

@@ -6,21 +6,22 @@ import { LiveCamera, figuresText } from './live_camera.js';
 import { recordButton } from './recorder.js';
 
 const said = document.getElementById('said');
+const say = (text, isProblem = false) => Object.assign(said, { textContent: text, className: isProblem ? 'problem' : '' });
 const app = {
   view: document.getElementById('view'),
   async doing(action) {
     try {
       return await action();
     } catch (error) {
-      said.textContent = error.message;
+      say(error.message, true);
       return undefined;
     }
   },
 };
 const { button: record } = recordButton(app, 'record', 'Record', 'phone', async ([file]) => {
-  said.textContent = 'sending …';
+  say('sending …');
   await upload('recording', file);
-  said.textContent = 'The video is in the project. Record again to replace it.';
+  say('The video is in the project. Record again to replace it.');
 });
 const live = el('button', { id: 'live', onclick: () => app.doing(toggle) }, 'Live');
 const picture = el('canvas', { id: 'live-picture', className: 'seen over', hidden: true });
@@ -48,7 +49,7 @@ async function toggle() {
       app.view.replaceChildren(el('div', { className: 'empty' }, 'What the camera sees appears here.'));
       live.textContent = 'Live';
       record.disabled = false;
-      if (!facts.problem) said.textContent = 'Live has ended.';
+      if (!facts.problem) say('Live has ended.');
     },
   });
   for (const name of Object.keys(facts)) delete facts[name];
@@ -62,13 +63,12 @@ async function toggle() {
 }
 
 function tell() {
-  if (!camera && !facts.problem) return;
+  if (!camera) return; // what was told last stays, until something else happens
   picture.hidden = !facts.tracking;
   const problem = facts.problem || facts.refused;
   const figures = camera?.figures();
-  said.textContent = problem || (facts.tracking ? figuresText(figures) || 'Tracking begins.'
-    : 'The studio sees what the camera sees. Take a frame there, click pairs on it, and go live.');
-  said.className = problem ? 'problem' : '';
+  say(problem || (facts.tracking ? figuresText(figures) || 'Tracking begins.'
+    : 'The studio sees what the camera sees. Take a frame there, click pairs on it, and go live.'), Boolean(problem));
   if (figures) Object.assign(said.dataset, { rate: figures.rate.toFixed(2), latency: figures.latency.toFixed(1) });
 }
 

@@ -8,13 +8,26 @@ const KINDS = [['video/webm;codecs=vp8', 'webm'], ['video/webm', 'webm'], ['vide
 export function recordButton(app, id, text, name, taken) {
   const button = el('button', { id }, text);
   let stop = null;
+  let isAsking = false;
+  let isClosed = false;
   button.addEventListener('click', () => app.doing(async () => {
     if (stop) return stop();
     if (!navigator.mediaDevices) throw new Error('the browser gives no camera to this page: open it as http://127.0.0.1');
-    const stream = await navigator.mediaDevices.getUserMedia({
-      video: { width: { ideal: 1280 }, facingMode: { ideal: 'environment' } }, audio: false,
-    });
+    if (isAsking) return undefined;
     const [type, ending] = KINDS.find(([kind]) => MediaRecorder.isTypeSupported(kind));
+    isAsking = true;
+    let stream;
+    try {
+      stream = await navigator.mediaDevices.getUserMedia({
+        video: { width: { ideal: 1280 }, facingMode: { ideal: 'environment' } }, audio: false,
+      });
+    } finally {
+      isAsking = false;
+    }
+    if (isClosed) { // the step was left while the browser asked
+      stream.getTracks().forEach((track) => track.stop());
+      return undefined;
+    }
     const recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: 20e6 });
     const parts = [];
     recorder.addEventListener('dataavailable', (event) => parts.push(event.data));
@@ -33,5 +46,5 @@ export function recordButton(app, id, text, name, taken) {
     };
     return undefined;
   }));
-  return { button, close: () => stop?.() };
+  return { button, close: () => { isClosed = true; stop?.(); } };
 }

@@ -15,6 +15,7 @@ export async function scanStart(app) {
   const mesh = await call('model_mesh');
   let scan = null;
   let image = null;
+  let solid = null;
   let number = 0; // of the keyframe that is shown
   let shown = null; // number of another place that is shown, null for the one that was found
   let hints = null;
@@ -77,10 +78,11 @@ export async function scanStart(app) {
     const text = el('output', { className: 'fixed' }, String(number));
     keyframe.addEventListener('input', () => { text.textContent = keyframes[keyframe.value]; });
     keyframe.addEventListener('change', () => app.doing(async () => {
-      number = keyframes[keyframe.value];
-      hints = noHints();
-      await showFrame();
-      drawPanel();
+      try {
+        await showFrame(keyframes[keyframe.value]);
+      } finally {
+        drawPanel();
+      }
     }));
     return there([
       el('h3', {}, 'Find the object'),
@@ -145,7 +147,8 @@ export async function scanStart(app) {
     image = new ImageView(imagePlace, pixelClicked);
     image.opacity = 0.5;
     const every = Int32Array.from({ length: mesh.triangles.length / 3 }, (_, i) => i);
-    const solid = new MeshView(meshPlace, mesh.nodes, mesh.triangles, every, ({ point }) => {
+    solid?.dispose();
+    solid = new MeshView(meshPlace, mesh.nodes, mesh.triangles, every, ({ point }) => {
       if (!scan.map) return;
       hints.pending.point = point;
       paired();
@@ -154,9 +157,12 @@ export async function scanStart(app) {
     Object.assign(meshPlace, { view: solid });
   }
 
-  async function showFrame() {
-    const [picture, overlay] = await Promise.all([scanFrame(number),
-      scan.place ? call('place_overlay', { frame: number, rival: shown }) : null]);
+  // Hints are of the keyframe that is shown; one that does not come leaves both.
+  async function showFrame(wanted = number) {
+    const [picture, overlay] = await Promise.all([scanFrame(wanted),
+      scan.place ? call('place_overlay', { frame: wanted, rival: shown }) : null]);
+    if (wanted !== number) hints = noHints();
+    number = wanted;
     image.setOverlay(overlay, mesh.triangles, PLAIN);
     image.setImage(picture);
     image.container.dataset.frame = number;
@@ -195,14 +201,14 @@ export async function scanStart(app) {
       ...(pending.pixel ? [{ pixel: pending.pixel, colour: PENDING }] : []),
       ...corners.map((pixel) => ({ pixel, colour: PENDING }))];
     image.draw();
-    document.getElementById('scan-mesh').view.mark([
+    solid.mark([
       ...pairs.map(([x, y, z]) => ({ point: [x / 1000, y / 1000, z / 1000], colour: COLOUR })),
       ...(pending.point ? [{ point: pending.point, colour: PENDING }] : [])]);
   }
 
   await load();
   return {
-    close: () => record.close(),
+    close: () => { record.close(); solid.dispose(); },
     job: (job, ended) => {
       if (!ended || !['slam', 'register'].includes(job.kind)) return;
       failure = job.status === 0 || job.stopped ? null : job.lines.at(-1);

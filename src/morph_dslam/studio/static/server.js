@@ -41,8 +41,8 @@ export async function scanFrame(number) {
 
 // Names become what the project takes: letters, digits and a few signs.
 export function properName(name) {
-  const plain = name.normalize('NFKD').replace(/[^A-Za-z0-9_. ()+-]/g, '_').replace(/^[^A-Za-z0-9_]+/, '');
-  return plain.slice(-100) || 'file';
+  const plain = name.normalize('NFKD').replace(/[^A-Za-z0-9_. ()+-]/g, '_').slice(-100);
+  return plain.replace(/^[^A-Za-z0-9_]+/, '') || 'file';
 }
 
 export async function upload(kind, file) {

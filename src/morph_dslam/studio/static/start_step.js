@@ -28,15 +28,18 @@ export async function startStep(app) {
   if (way.value === 'scan') return scanStart(app);
   const aside = el('p', { className: 'warning note', id: 'pairs-note', hidden: !app.state.notes.start }, app.state.notes.start ?? '');
   app.panel.append(aside);
-  const [mesh, known, model, { colours }] = await Promise.all([
-    call('model_mesh'), call('start_files'), call('model'), explored('model.json')]);
-  const first = recording.first;
-  const last = recording.first + recording.frames - 1;
+  const [mesh, known, model, { colours }, { numbers }] = await Promise.all([
+    call('model_mesh'), call('start_files'), call('model'), explored('model.json'), call('frame_numbers')]);
+  const { first, last } = recording;
+  // Of images some numbers may be missing.
+  const nearest = (wanted) => (numbers ?? []).reduce((a, b) => (Math.abs(b - wanted) < Math.abs(a - wanted) ? b : a), numbers?.[0] ?? wanted);
   let pairs = known.pairs;
   let pending = { point: null, pixel: null };
   let fitted = null;
   let saved = pairs.length > 0;
-  let number = known.frame ?? first;
+  let number = known.frame ?? first; // of the frame that is shown
+  let clickedIn = number; // of the frame that the pairs belong to
+  const isElsewhere = () => pairs.length > 0 && clickedIn !== number;
 
   const left = el('div', {}, el('span', { className: 'tag' }, 'image'));
   const right = el('div', {}, el('span', { className: 'tag' }, 'undeformed model'));
@@ -45,7 +48,7 @@ export async function startStep(app) {
   left.append(imagePlace);
   right.append(meshPlace, el('p', { className: 'hint' }, 'Drag turns or shifts, wheel zooms, click sets a point.'));
   app.view.append(el('div', { className: 'split' }, left, right));
-  const image = new ImageView(imagePlace, (pixel) => { pending.pixel = pixel; paired(); });
+  const image = new ImageView(imagePlace, (pixel) => { if (!isElsewhere()) { pending.pixel = pixel; paired(); } });
   const faces = Int32Array.from({ length: mesh.triangles.length / 3 }, (_, i) => i);
   const solid = new MeshView(meshPlace, mesh.nodes, mesh.triangles, faces, ({ point }) => { pending.point = point; paired(); });
   imagePlace.view = image;
@@ -59,18 +62,26 @@ export async function startStep(app) {
   const list = el('ul', { className: 'list', id: 'pairs' });
   const result = el('div', { id: 'fit' });
   const save = el('button', { id: 'save-start', className: 'main', onclick: () => app.doing(async () => {
-    await call('save_start', { pairs, frame: number, at_rest: atRest.checked, recording_number });
+    await call('save_start', { pairs, frame: clickedIn, at_rest: atRest.checked, recording_number });
     saved = true;
     aside.hidden = true;
     await app.refresh();
     draw();
   }) }, 'Save');
-  frameInput.addEventListener('input', () => { frameText.textContent = frameInput.value; });
+  frameInput.addEventListener('input', () => { frameText.textContent = nearest(Number(frameInput.value)); });
+  let wanted = number;
   frameInput.addEventListener('change', () => app.doing(async () => {
-    number = Number(frameInput.value);
-    image.setImage(await frame(number));
-    saved = false;
-    draw();
+    const asked = wanted = nearest(Number(frameInput.value));
+    try {
+      const picture = await frame(asked);
+      if (asked !== wanted) return; // another one was asked for meanwhile
+      number = asked;
+      pending.pixel = null;
+      image.setImage(picture);
+    } finally {
+      if (asked === wanted) frameInput.value = frameText.textContent = wanted = number;
+      draw();
+    }
   }));
   app.panel.append(
     el('div', { className: 'row' }, el('span', { className: 'fixed' }, 'Frame'), frameInput, frameText),
@@ -84,6 +95,7 @@ export async function startStep(app) {
       dropZone('drop-landmarks', 'Drop landmarks.csv', 'x_mm, y_mm, z_mm, u_px, v_px', '.csv', ([file]) => app.doing(async () => {
         await upload('landmarks', file);
         pairs = (await call('start_files')).pairs;
+        clickedIn = number;
         await call('save_start', { pairs, frame: number, at_rest: atRest.checked, recording_number });
         aside.hidden = true;
         await app.refresh();
@@ -94,6 +106,7 @@ export async function startStep(app) {
 
   function paired() {
     if (pending.point && pending.pixel) {
+      if (!pairs.length) clickedIn = number;
       pairs = [...pairs, [...pending.point.map((x) => Math.round(1e6 * x) / 1e3), ...pending.pixel]];
       pending = { point: null, pixel: null };
       fit();
@@ -131,9 +144,10 @@ export async function startStep(app) {
     const worst = fitted?.residuals_px ? fitted.worst : -1;
     const errors = fitted?.residuals_px ?? [];
     const colour = (i) => (i === worst && errors.length > 4 ? WORST : GOOD);
-    image.marks = pairs.map(([, , , u, v], i) => ({ pixel: [u, v], colour: colour(i), label: String(i + 1) }));
+    const elsewhere = isElsewhere();
+    image.marks = elsewhere ? [] : pairs.map(([, , , u, v], i) => ({ pixel: [u, v], colour: colour(i), label: String(i + 1) }));
     if (pending.pixel) image.marks.push({ pixel: pending.pixel, colour: PENDING });
-    image.setOverlay(fitted, mesh.triangles, atRest.checked ? PLAIN : colours);
+    image.setOverlay(elsewhere ? null : fitted, mesh.triangles, atRest.checked ? PLAIN : colours);
     const points = pairs.map(([x, y, z], i) => ({ point: [x / 1000, y / 1000, z / 1000], colour: colour(i) }));
     if (pending.point) points.push({ point: pending.point, colour: PENDING });
     solid.mark(points);
@@ -142,7 +156,10 @@ export async function startStep(app) {
       el('small', { className: i === worst && errors.length > 4 ? 'problem' : '' }, errors[i] === undefined ? '' : `${errors[i].toFixed(2)} px`),
       el('button', { className: 'plain', title: 'take out', onclick: () => { pairs.splice(i, 1); fit(); } }, '✕'))));
     const waiting = pending.point ? 'Now click the same point in the image.' : pending.pixel ? 'Now click the same point on the mesh.' : '';
-    if (waiting) result.replaceChildren(el('p', { className: 'warning' }, waiting));
+    if (elsewhere) {
+      result.replaceChildren(el('p', { className: 'warning', id: 'elsewhere' },
+        `The pairs belong to frame ${clickedIn}: go back to it, or clear them to click pairs in this one.`));
+    } else if (waiting) result.replaceChildren(el('p', { className: 'warning' }, waiting));
     else if (!fitted) result.replaceChildren();
     else if (fitted.message) result.replaceChildren(el('p', { className: fitted.refused ? 'problem' : 'note' }, fitted.message));
     else {
@@ -153,8 +170,8 @@ export async function startStep(app) {
       ...fitted.warnings.map((one) => el('p', { className: 'warning note' }, one)));
     }
     left.querySelector('.bar')?.remove();
-    if (fitted?.pixels && !atRest.checked) left.append(colourBar(colours, fitted));
-    save.disabled = !fitted?.pixels || saved;
+    if (fitted?.pixels && !elsewhere && !atRest.checked) left.append(colourBar(colours, fitted));
+    save.disabled = !fitted?.pixels || saved || elsewhere;
     save.textContent = saved && pairs.length ? 'Saved' : 'Save';
     result.dataset.pairs = fitting ? '' : String(pairs.length);
   }
@@ -162,5 +179,5 @@ export async function startStep(app) {
   image.setImage(await frame(number));
   if (pairs.length) { const was = saved; await fit(); saved = was; }
   draw();
-  return { close: () => clearTimeout(thorough), recording: () => app.show('start') };
+  return { close: () => { clearTimeout(thorough); solid.dispose(); }, recording: () => app.show('start') };
 }

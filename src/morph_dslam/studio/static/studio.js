@@ -1,7 +1,7 @@
 // The frame of the studio: steps, the command that runs, messages.
 
 import * as server from './server.js';
-import { el, time } from './parts.js';
+import { el, time, title } from './parts.js';
 import { objectStep } from './object_step.js';
 import { studyStep } from './study_step.js';
 import { buildStep } from './build_step.js';
@@ -20,13 +20,23 @@ class Studio {
   constructor() {
     this.run = { frames: [] };
     this.open = {};
+    this.makeBar();
+    // Files that miss a place to be dropped on would take the place of the page.
+    for (const name of ['dragover', 'drop']) document.body.addEventListener(name, (event) => event.preventDefault());
     // Steps call these through an object of their own.
     for (const name of ['refresh', 'show', 'doing', 'message']) this[name] = this[name].bind(this);
   }
 
   async start() {
-    await this.refresh();
+    try {
+      await this.refresh();
+    } catch (error) {
+      document.getElementById('panel').replaceChildren(...title('The studio cannot begin', 'Load this page again once this is mended.'),
+        el('p', { className: 'problem' }, error.message));
+      return;
+    }
     server.listen({
+      phone: (address) => { this.state.phone = address; this.open.phone?.(); },
       recording: () => this.doing(async () => { await this.refresh(); await this.open.recording?.(); }),
       job: (job) => this.takeJob(job), frames: (news) => this.takeFrames(news),
     });
@@ -106,27 +116,34 @@ class Studio {
 
   takeFrames(news) {
     if (news.anew) this.run.frames = [];
-    this.run.frames.push(...news.frames);
+    for (const row of news.frames) this.run.frames.push(row);
     this.open.frames?.(this.run.frames);
+  }
+
+  // Made once: a button that another one takes the place of between press and release is not clicked.
+  makeBar() {
+    const done = el('i');
+    this.bar = {
+      words: el('strong', { id: 'job-words' }), command: el('code'), done, progress: el('div', { className: 'progress' }, done),
+      stop: el('button', { id: 'job-stop', onclick: () => this.doing(() => server.call('stop')) }, 'Stop'),
+    };
+    const { words, command, progress, stop } = this.bar;
+    document.getElementById('job').append(words, command, progress, stop);
   }
 
   drawJob() {
     const { job } = this.state;
-    const footer = document.getElementById('job');
-    footer.hidden = !job;
+    document.getElementById('job').hidden = !job;
     if (!job) return;
     const share = job.total ? Math.min(1, job.done / job.total) : 0;
     const words = job.running
       ? `${job.what}${job.total ? ` ${job.done} of ${job.total}` : ''}${job.left_s ? `, ${time(job.left_s)} left` : ''}`
       : job.status === 0 ? `done in ${time(job.seconds)}` : job.stopped ? 'stopped' : 'ended with an error';
     const kind = job.running ? '' : job.status === 0 ? 'good' : job.stopped ? 'warning' : 'problem';
-    footer.replaceChildren(
-      el('strong', { className: kind, id: 'job-words' }, words),
-      el('code', { title: job.command }, job.command),
-      job.running ? el('div', { className: 'progress' }, el('i', { style: `width: ${100 * share}%` })) : el('span'),
-      job.running ? el('button', { id: 'job-stop', onclick: () => this.doing(() => server.call('stop')) }, 'Stop')
-        : el('span'),
-    );
+    Object.assign(this.bar.words, { className: kind, textContent: words });
+    Object.assign(this.bar.command, { title: job.command, textContent: job.command });
+    this.bar.done.style.width = `${100 * share}%`;
+    this.bar.progress.hidden = this.bar.stop.hidden = !job.running;
   }
 }
 

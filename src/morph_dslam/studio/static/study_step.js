@@ -1,7 +1,7 @@
 // Study: material, supports, loads and parameters by forms, and the file beside them; each changes the other.
 
 import { call } from './server.js';
-import { check, choice, command, el, field, title } from './parts.js';
+import { check, choice, command, el, field, there, title } from './parts.js';
 
 const UNITS = {
   stress: 'MPa', pressure: 'kPa', ratio: '', density: 'kg/m3', traction: 'kPa', force: 'N', x: 'mm', y: 'mm', z: 'mm',
@@ -35,19 +35,43 @@ export async function studyStep(app) {
   });
 
   const take = (found) => { study = found; draw(); app.refresh(); };
-  const write = () => app.doing(async () => take(await call('write_study', { text: text.value })));
-  const change = (section, key, value) => app.doing(async () => {
-    if (!save.disabled) await call('write_study', { text: text.value });
-    take(await call('change_study', { section, key, value }));
+  const show = () => { text.value = study.text; save.disabled = true; };
+  const write = () => app.doing(async () => {
+    const sent = text.value;
+    take(await call('write_study', { text: sent }));
+    if (text.value === sent) show(); // what was typed meanwhile is kept
   });
+  // changes: [section, key, value], of which the last one is shown. The text is not to be typed in until it has them all.
+  const change = (...changes) => app.doing(async () => {
+    text.readOnly = true;
+    try {
+      if (!save.disabled) await call('write_study', { text: text.value });
+      let found = study;
+      for (const [section, key, value] of changes) found = await call('change_study', { section, key, value });
+      take(found);
+      show();
+    } finally {
+      text.readOnly = false;
+    }
+  });
+  // An entry that a form has changed, under a name that may be another one now.
+  function changeNamed(section, known, before, name, value) {
+    const changes = [[section, name, value]];
+    if (before !== null && before !== name) {
+      if (name in known) { app.message(`There is another ${name} already.`); return; }
+      changes.push([section, before, null]);
+    }
+    change(...changes);
+  }
 
   function draw() {
-    text.value = study.text;
-    save.disabled = true;
     const content = study.content ?? {};
     const lists = Object.keys(LISTS).map((section) => listed(section, content[section] ?? []));
     panel.replaceChildren(...materials(content.materials ?? {}), ...lists.flat(), ...parameters(content.parameters ?? {}),
-      command('writes study.toml'), el('button', { id: 'to-build', onclick: () => app.show('build') }, 'Next: build'));
+      command('writes study.toml'), el('button', { id: 'to-build', onclick: async () => {
+        if (!save.disabled) await write();
+        if (save.disabled) app.show('build'); // else it could not be saved, which is said
+      } }, 'Next: build'));
     const lines = [...study.problems.map((one) => ['problem', one]), ...study.warnings.map((one) => ['warning', one])];
     says.replaceChildren(lines.length
       ? el('ul', {}, ...lines.map(([kind, one]) => el('li', { className: kind }, one)))
@@ -57,18 +81,18 @@ export async function studyStep(app) {
   function entries(id, rows) {
     return el('ul', { className: 'list', id }, ...rows.map(([name, small, edit, remove]) => el('li', {},
       el('span', { title: small }, name, ' ', el('small', {}, small)),
-      el('button', { className: 'plain', onclick: edit }, 'edit'),
+      ...there([edit && el('button', { className: 'plain', onclick: edit }, 'edit')]),
       el('button', { className: 'plain', title: 'take out', onclick: remove }, '✕'))));
   }
 
   function materials(known) {
     const form = el('div');
     const rows = Object.entries(known).map(([name, entry]) => [name, `${entry.law}: ${words(entry)}`,
-      () => lawForm(form, name, entry), () => change('materials', name, null)]);
+      entry.law in forms.laws ? () => lawForm(form, known, name, entry, name) : null, () => change(['materials', name, null])]);
     const pick = choice('material', [['', 'Choose a material …'],
       ...forms.materials.map((one, i) => [String(i), one.title]), ['own', 'Own constants …']]);
     pick.addEventListener('change', () => {
-      if (pick.value === 'own') lawForm(form, 'material', { law: 'neo_hookean' });
+      if (pick.value === 'own') lawForm(form, known, 'material', { law: 'neo_hookean' });
       else if (pick.value) libraryForm(form, forms.materials[Number(pick.value)]);
       else form.replaceChildren();
     });
@@ -79,11 +103,12 @@ export async function studyStep(app) {
     form.replaceChildren(el('div', { className: 'box' },
       el('p', {}, words(entry.section), ` (${entry.section.law})`),
       el('p', { className: 'note' }, entry.note), el('p', { className: 'note' }, `Source: ${entry.source}`),
-      el('button', { id: 'add-material', className: 'main', onclick: () => change('materials', entry.name, entry.section) },
+      el('button', { id: 'add-material', className: 'main', onclick: () => change(['materials', entry.name, entry.section]) },
         'Use it')));
   }
 
-  function lawForm(form, name, entry) {
+  // before: name of the entry that is edited, null for a new one.
+  function lawForm(form, known, name, entry, before = null) {
     const nameInput = el('input', { id: 'material-name', value: name });
     const law = choice('law', Object.keys(forms.laws).map((one) => [one, one]), entry.law);
     const place = el('div');
@@ -95,12 +120,14 @@ export async function studyStep(app) {
     form.replaceChildren(el('div', { className: 'box' },
       el('div', { className: 'row' }, field('Name', nameInput), field('Law', law)), place,
       el('button', { id: 'add-material', className: 'main', onclick: () => {
-        const section = { ...(entry.on ? { on: entry.on } : {}), law: law.value };
+        // What the form does not show stays, constants of another law go.
+        const section = { ...entry, law: law.value };
+        for (const [key] of [...forms.laws[entry.law], ...forms.laws[law.value]]) delete section[key];
         for (const [key, quantity] of forms.laws[law.value]) {
           const value = place.querySelector(`#constant-${key}`).value.trim();
           if (value) section[key] = withUnit(value, quantity);
         }
-        change('materials', nameInput.value, section);
+        changeNamed('materials', known, before, nameInput.value.trim(), section);
       } }, 'Save material')));
   }
 
@@ -116,7 +143,7 @@ export async function studyStep(app) {
   function listed(section, known) {
     const form = el('div');
     const rows = known.map((entry, i) => [`${entry.kind}${entry.on ? ` on ${entry.on}` : ''}`, words(entry),
-      () => kindForm(form, section, i, entry), () => change(section, i, null)]);
+      () => kindForm(form, section, i, entry), () => change([section, i, null])]);
     const add = el('button', { id: `add-${section}`, className: 'plain', onclick: () => kindForm(form, section, known.length,
       { kind: FIRST[section] }) }, '+ add');
     return [el('div', { className: 'row', style: 'margin: 24px 0 4px; align-items: center' },
@@ -139,7 +166,7 @@ export async function studyStep(app) {
           const found = read(place.querySelector(`#${section}-${one.key}`), one);
           if (found !== null) value[one.key] = found;
         }
-        change(section, position, value);
+        change([section, position, value]);
       } }, 'Save')));
   }
 
@@ -149,7 +176,7 @@ export async function studyStep(app) {
     if (kind === 'flag') return check(FLAGS[key] ?? key.replaceAll('_', ' '), el('input', { id, checked: value ?? false }));
     if (kind === 'set') {
       const sets = required ? study.sets : ['', ...study.sets, ...study.cell_sets];
-      return field('On', choice(id, sets.map((one) => [one, one || 'everything']), value));
+      return field(key === 'on' ? 'On' : 'Against', choice(id, sets.map((one) => [one, one || 'everything']), value));
     }
     const unit = kind === 'numbers' ? '' : UNITS[key] ?? '';
     const many = kind !== 'value';
@@ -174,15 +201,15 @@ export async function studyStep(app) {
   function parameters(known) {
     const form = el('div');
     const rows = Object.entries(known).map(([name, entry]) => [name, `${entry.range?.join(' to ')}`,
-      () => parameterForm(form, name, entry), () => change('parameters', name, null)]);
+      () => parameterForm(form, known, name, entry, name), () => change(['parameters', name, null])]);
     return [el('div', { className: 'row', style: 'margin: 24px 0 4px; align-items: center' },
       el('h3', { style: 'margin: 0' }, 'Parameters'),
-      el('button', { id: 'add-parameters', className: 'plain', onclick: () => parameterForm(form, '', {}) }, '+ add')),
+      el('button', { id: 'add-parameters', className: 'plain', onclick: () => parameterForm(form, known, '', {}) }, '+ add')),
     el('p', { className: 'note' }, 'What is estimated in every frame: a motion, a load, a modulus.'),
     entries('parameters', rows), form];
   }
 
-  function parameterForm(form, name, entry) {
+  function parameterForm(form, known, name, entry, before = null) {
     const [low, high] = entry.range ?? ['', ''];
     const inputs = {
       name: el('input', { id: 'parameter-name', value: name, placeholder: 'push' }),
@@ -193,12 +220,14 @@ export async function studyStep(app) {
     form.replaceChildren(el('div', { className: 'box' }, field('Name, as values above use it', inputs.name),
       el('div', { className: 'row' }, field('From', inputs.low), field('To', inputs.high), field('Default', inputs.start)),
       el('button', { id: 'save-parameters', className: 'main', onclick: () => {
-        const value = { range: [plainNumber(inputs.low.value.trim()), plainNumber(inputs.high.value.trim())] };
+        const value = { ...entry, range: [plainNumber(inputs.low.value.trim()), plainNumber(inputs.high.value.trim())] };
+        delete value.default;
         if (inputs.start.value.trim()) value.default = plainNumber(inputs.start.value.trim());
-        change('parameters', inputs.name.value.trim(), value);
+        changeNamed('parameters', known, before, inputs.name.value.trim(), value);
       } }, 'Save')));
   }
 
   draw();
+  show();
   return {};
 }

@@ -1,0 +1,13 @@
+// In the place of views that need WebGL.
+
+export const colourOf = () => [1, 2, 3, 255];
+
+export class MeshView {
+  colour() {}
+
+  mark() {}
+
+  dispose() { this.isGone = true; }
+}
+
+export class SolidView extends MeshView {}
