@@ -155,7 +155,7 @@ class Socket {
 
   tell(name, event) { this.listeners[name](event); return wait(); }
 
-  close() {}
+  close() { this.isClosed = true; }
 }
 
 class Recorder {

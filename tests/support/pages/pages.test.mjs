@@ -352,3 +352,17 @@ test('more frames than a call takes arguments come at once', async () => {
   events.frames({ anew: true, frames: Array(200_000).fill({}) });
   await wait();
 });
+
+test('a step that fails while it is opened lets its connection go when it is left', async () => {
+  page(...FRAME);
+  const recording = { first: 0, frames: 3, width: 6, height: 4, fps: 30 };
+  serve({ state: () => ({ ...STATE, recording }), frame: () => 'the frame cannot be read' });
+  await import('./studio.js?failed');
+  await find('step-camera').click();
+  await wait();
+  assert.equal(find('message').textContent, 'the frame cannot be read');
+  const socket = WebSocket.last;
+  assert.equal(socket.isClosed, undefined);
+  await find('step-results').click();
+  assert.equal(socket.isClosed, true);
+});

@@ -115,7 +115,7 @@ export async function cameraStep(app) {
   await draw();
   showLive();
   return {
-    close: () => [record, recordBoard, live].forEach((one) => one.close()),
+    close: () => [record, recordBoard].forEach((one) => one.close()),
     recording: draw,
     phone: drawPhone,
     job: (job, ended) => { if (ended && job.kind === 'calibrate') app.doing(draw); },

@@ -37,7 +37,7 @@ export function liveView(app, container, told) {
     await call('take_frame');
     await app.show('start');
   }) }, 'Take this frame');
-  const live = { facts: {}, isCovered: () => false, parts: [status, el('div', { className: 'row' }, button, take)], close };
+  const live = { facts: {}, isCovered: () => false, parts: [status, el('div', { className: 'row' }, button, take)] };
   let closed = false;
   let socket = null;
   container.append(canvas);
@@ -76,13 +76,14 @@ export function liveView(app, container, told) {
 
   function close() {
     closed = true;
-    redraw = () => {};
+    if (redraw === draw) redraw = () => {};
     clearInterval(timer);
     socket.close();
   }
 
   const timer = setInterval(draw, 1000);
   redraw = draw;
+  app.whenLeft(close);
   listen();
   draw();
   return live;

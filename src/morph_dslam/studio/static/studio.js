@@ -68,7 +68,7 @@ class Studio {
   }
 
   async show(id) {
-    this.open.close?.();
+    this.leave?.();
     this.current = id;
     history.replaceState(null, '', `#${id}`);
     this.drawSteps();
@@ -78,14 +78,18 @@ class Studio {
     document.getElementById('view').replaceChildren(view);
     document.getElementById('panel').scrollTop = 0;
     const opened = {};
-    this.open = opened;
+    const left = [];
+    const leave = () => { opened.close?.(); left.splice(0).forEach((action) => action()); };
+    Object.assign(this, { open: opened, leave });
     await this.doing(async () => {
       await this.refresh();
-      const step = Object.create(this, { panel: { value: panel }, view: { value: view } });
+      // A step that fails while it is opened has something to let go, too.
+      const whenLeft = (action) => left.push(action);
+      const step = Object.create(this, { panel: { value: panel }, view: { value: view }, whenLeft: { value: whenLeft } });
       Object.assign(opened, await STEPS.find(([key]) => key === id)[2](step));
     });
     if (this.open === opened) document.getElementById('panel').dataset.ready = id;
-    else opened.close?.();
+    else leave();
   }
 
   async doing(action) {

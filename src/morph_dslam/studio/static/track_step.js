@@ -108,5 +108,5 @@ export async function trackStep(app) {
 
   drawJob(app.state.job);
   drawFrames(app.run.frames);
-  return { close: live.close, job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
+  return { job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
 }
