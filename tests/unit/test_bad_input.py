@@ -174,6 +174,23 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
             make_run_folder(tmp_path / name, overwrite=True)
 
 
+def test_nothing_of_a_run_that_is_overwritten_stands_in_the_report_of_the_next(tmp_path):
+    write_run(tmp_path)
+    run = load_run(tmp_path)
+    (tmp_path / "plots").mkdir(exist_ok=True)
+    picture = cv2.imencode(".png", np.zeros((2, 2, 3), dtype=np.uint8))[1].tobytes()
+    of_the_run = ("plots/jumps.png", "plots/points.png", "evaluation.png", "error_map.png", "pixel_error_map.png")
+    for name in (*of_the_run, "own.png"):
+        (tmp_path / name).write_bytes(picture)
+    for name in ("latency.csv", "augmented.mp4", "report.html", "notes.txt", "plots/own.txt"):
+        (tmp_path / name).write_text("")
+    make_run_folder(tmp_path, overwrite=True)
+    assert "<img" not in write_run_report(tmp_path, run).read_text()
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert not left & {*of_the_run, "latency.csv", "augmented.mp4"}
+    assert left >= {"own.png", "notes.txt", "plots/own.txt", "result.h5", "model.morph"}  # the reader's own, the run
+
+
 def test_a_run_folder_has_one_writer(tmp_path):
     run = tmp_path / "a" / "run"
     with only_writer(run):

@@ -29,8 +29,15 @@ def check_free(sign: Path, held: str, overwrite: bool, kind: type[MorphError]) -
         )
 
 
+#: What not every run and evaluation writes into its folder, or not under the same names, and reports show.
+_OF_ONE_RUN = (
+    *("plots/*.png", "augmented.mp4", "latency.csv", "report.html"),
+    *("*evaluation.json", "*evaluation.png", "*error_map.png"),
+)
+
+
 def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> None:
-    """Make a run folder and those above it; evaluations of a run that is to be overwritten are deleted.
+    """Make a run folder and those above it; pictures and evaluations of a run that is to be overwritten are deleted.
 
     Parameters
     ----------
@@ -45,8 +52,8 @@ def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> N
     """
     check_free(folder / sign, "a run", overwrite, TrackingError)
     _make(folder)
-    # They would stand in the report of the new run.
-    for old in folder.glob("*evaluation.json"):
+    # They would stand in the report of the new run, or beside it as if they were of it.
+    for old in (path for pattern in _OF_ONE_RUN for path in folder.glob(pattern)):
         old.unlink()
 
 
