@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 STEP = 40_000_000  # nanoseconds
 START = 1_700_000_000_500_000_000
+TOPIC = "/camera/image_raw"
 COLOUR = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
 
 
@@ -68,7 +69,7 @@ def write_bag(path, version, messages, storage=StoragePlugin.SQLITE3):
 def sequence(types, n_frames=3, stamped=True):
     return [
         (
-            "/camera/image_raw",
+            TOPIC,
             image_message(types, START + k * STEP if stamped else 0, COLOUR + k, "bgr8"),
             START + k * STEP + 7_000_000,
         )
@@ -152,6 +153,25 @@ def test_one_of_several_topics_is_chosen_by_name(tmp_path):
         open_source(path)
     (frame,) = open_source(f"{path}#/right")
     assert frame.image[0, 0, 0] == 2
+
+
+def test_all_nodes_that_send_a_topic_are_read(tmp_path):
+    # A camera's node that was started again has another connection.
+    types = ros_types(1)
+    with Writer1(tmp_path / "camera.bag") as writer:
+        first, second = (
+            writer.add_connection(TOPIC, "sensor_msgs/msg/Image", typestore=types, callerid=name)
+            for name in ("/node_1", "/node_2")
+        )
+        for i in range(10):
+            message = image_message(types, (100 + i) * 10**9, np.full((4, 6), 10 * i, dtype=np.uint8), "mono8")
+            data = types.serialize_ros1(message, message.__msgtype__)
+            writer.write(first if i < 6 else second, (100 + i) * 10**9, data)
+    source = open_source(tmp_path / "camera.bag")
+    frames = list(source)
+    assert len(source) == 10
+    assert [frame.timestamp for frame in frames] == [100.0 + i for i in range(10)]
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [10 * i for i in range(10)]
 
 
 def test_bags_that_are_refused(tmp_path, monkeypatch):

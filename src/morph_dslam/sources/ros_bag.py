@@ -72,9 +72,12 @@ def _reader(path: Path) -> Iterator[AnyReader]:
         raise SourceError(f"{path} cannot be read as a ROS bag: {error}") from error
 
 
-def _choose_topic(path: Path, reader: AnyReader, topic: str | None) -> Connection:
-    """The connection of the wanted images."""
-    images = {c.topic: c for c in reader.connections if c.msgtype in IMAGE_TYPES and c.msgcount}
+def _choose_topic(path: Path, reader: AnyReader, topic: str | None) -> list[Connection]:
+    """The connections of the wanted images: one for each node that sent them, and each time it was started."""
+    images: dict[str, list[Connection]] = {}
+    for connection in reader.connections:
+        if connection.msgtype in IMAGE_TYPES and connection.msgcount:
+            images.setdefault(connection.topic, []).append(connection)
     if not images:
         raise SourceError(f"{path} holds no images, but the topics {', '.join(sorted(reader.topics)) or 'none'}")
     if topic is None and len(images) == 1:
@@ -103,11 +106,11 @@ class RosBag:
         path, topic = _split_topic(path)
         self._path = path
         with _reader(path) as reader:
-            connection = _choose_topic(path, reader, topic)
-            begun = islice(reader.messages(connections=[connection]), N_TIMED)
+            connections = _choose_topic(path, reader, topic)
+            begun = islice(reader.messages(connections=connections), N_TIMED)
             self.fps = usual_rate([1e-9 * received for _, received, _ in begun])
-        self._topic = connection.topic
-        self._first, self._last = check_range(path, range(connection.msgcount), first, last)
+        self._topic = connections[0].topic
+        self._first, self._last = check_range(path, range(sum(c.msgcount for c in connections)), first, last)
         self.name = f"{path}#{self._topic}"
 
     def __len__(self) -> int:
@@ -116,8 +119,8 @@ class RosBag:
     def __iter__(self) -> Iterator[Frame]:
         size = None
         with _reader(self._path) as reader:
-            connection = _choose_topic(self._path, reader, self._topic)
-            for index, (_, received, data) in enumerate(reader.messages(connections=[connection])):
+            connections = _choose_topic(self._path, reader, self._topic)
+            for index, (connection, received, data) in enumerate(reader.messages(connections=connections)):
                 if index < self._first:
                     continue
                 if index > self._last:
