@@ -2,6 +2,7 @@
 
 import http.client
 import socket
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
@@ -17,7 +18,7 @@ from websockets.sync.client import connect
 from morph_dslam.errors import StreamError
 from morph_dslam.extend.streams import StreamedObject, StreamSink
 from morph_dslam.extend.studies import build_rigid
-from morph_dslam.streams.messages import ObjectInfo, SceneMessage
+from morph_dslam.streams.messages import FrameMessage, ObjectInfo, SceneMessage
 from morph_dslam.streams.websocket import WAITING, WebSocketPublisher
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
 from tests.support.inner_structures import NODES, TRIANGLES, inner_structure, moved
@@ -218,6 +219,26 @@ def test_a_late_client_gets_the_mesh_and_then_the_newest_frame(publisher, sink, 
     assert [next(late)["type"], next(late)["frame"]] == ["scene", 2]
 
 
+def test_a_client_after_nobody_watched_gets_no_frame_of_before(publisher, sink, model):
+    first = taking(publisher)
+    sink(tracked_frame(0, 0.0, block=tracked_result(model, 0.1, 0.0)))
+    assert next(first)["frame"] == 0
+    first.close()
+    gone = tracked_frame(1, 1.0, block=tracked_result(model, 0.2, 0.0))
+    wait_until(lambda: sink(gone) or not publisher.is_watched)  # noticed when it does not take a frame
+    late = taking(publisher)
+    sink(tracked_frame(2, 2.0, block=tracked_result(model, 0.3, 0.0)))
+    assert next(late)["frame"] == 2
+
+
+def test_a_frame_that_finds_no_client_is_not_kept(publisher, model):
+    publisher.begin(SceneMessage(CAMERA, ()))
+    publisher.publish(FrameMessage(0, 0, 0.0, None, np.zeros((4, 4, 3), np.uint8), tuple))
+    late = taking(publisher)
+    publisher.publish(FrameMessage(1, 1, 0.1, None, np.zeros((4, 4, 3), np.uint8), tuple))
+    assert next(late)["number"] == 1
+
+
 def test_nobody_waits_for_a_slow_client_who_misses_frames_and_gets_the_newest(publisher, sink, model):
     received, n_sent = taking(publisher), 3000
     with connect(stream_address(publisher), **PLAIN) as slow, ThreadPoolExecutor(2) as pool:
@@ -296,6 +317,18 @@ def test_strangers_are_refused(publisher, token, headers, status):
             pass
         assert refused.value.response.status_code == status
     assert not publisher.is_watched
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="has one address of this computer only")
+def test_the_address_is_the_one_that_was_asked_for():
+    # This computer's name may stand for another address, at which nobody listens.
+    publisher = WebSocketPublisher("127.0.0.2")
+    try:
+        assert urlsplit(publisher.place).netloc == f"127.0.0.2:{publisher.port}"
+        with connect(publisher.place.replace("http", "ws").replace("/?", "/stream?")):
+            wait_until(lambda: publisher.is_watched)
+    finally:
+        publisher.close()
 
 
 def ask(publisher, path, **headers):

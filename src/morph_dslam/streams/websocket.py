@@ -111,9 +111,10 @@ class WebSocketPublisher:
         self.token = stream_token()
         self._socket = _listening(host, port)
         self.port = int(self._socket.getsockname()[1])
-        self._name = HOST if host in (HOST, "localhost") else socket.gethostname()
-        names = () if self._name == HOST else (host, self._name)
-        self._gate = StreamGate(self.token, HOST if self._name == HOST else host, self.port, names)
+        is_own = host in (HOST, "localhost")
+        self._name = HOST if is_own else _name_for_others(host)
+        names = () if is_own else (host, socket.gethostname())
+        self._gate = StreamGate(self.token, HOST if is_own else host, self.port, names)
         self._clients: set[ServerConnection] = set()
         self._ready = threading.Event()
         self._failure: OSError | None = None
@@ -143,10 +144,11 @@ class WebSocketPublisher:
         self._change(change)
 
     def publish(self, message: FrameMessage) -> None:
-        """Tell a frame to all clients that have time for it."""
+        """Tell a frame to all clients that have time for it; it is not kept for those that come later."""
 
         def change(newest: _Newest) -> None:
-            newest.frame, newest.n_frames = message, newest.n_frames + 1
+            if self._clients:
+                newest.frame, newest.n_frames = message, newest.n_frames + 1
 
         self._change(change)
 
@@ -222,6 +224,8 @@ class WebSocketPublisher:
         finally:
             ended.cancel()
             self._clients.discard(client)
+            if not self._clients:
+                newest.frame = None  # it would be old when one comes
 
     def _answer(self, client: ServerConnection, request: Request) -> Response | None:
         """Refuse a request, or answer it with a file of the page; None to go on with a WebSocket."""
@@ -278,6 +282,13 @@ def _policy(host: str) -> str:
         "img-src 'self' data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'; "
         "form-action 'none'"
     )
+
+
+def _name_for_others(host: str) -> str:
+    """How an address names a host that listens: one that stands for all of its addresses says nothing to others."""
+    if host in ("0.0.0.0", "::"):
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
 
 
 def _listening(host: str, port: int) -> socket.socket:
