@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
+from scipy.stats import t as student
 
 from morph_dslam.cli.app import main
 from morph_dslam.errors import IdentificationError
@@ -179,6 +180,33 @@ def test_deviations_are_those_of_repeated_tests(kind):
         ]
     # 95 % within for independent errors; smooth ones are known less well, but not by a factor.
     assert np.mean(outside) < (0.12 if kind == "independent" else 0.3)
+
+
+@pytest.mark.parametrize("points", [2, 3, 6])
+def test_intervals_of_few_points_hold(points):
+    """The stress is linear in the one constant, so the interval is Student's of a line through the origin."""
+    stretch, noise, found, expected = np.linspace(1.1, 1.8, points), np.random.default_rng(points), [], []
+    shape = 2.0 * (stretch - stretch**-2)
+    for _ in range(20):
+        stress = 0.2 * MPA * shape + noise.normal(0.0, 0.02 * MPA, points)
+        # A point without strain tells nothing.
+        fit = fit_candidate("neo_hookean", [made("uniaxial", np.r_[1.0, stretch], np.r_[0.0, stress])]).fit
+        c10 = float(shape @ stress / (shape @ shape))
+        left = stress - c10 * shape
+        correlation = min(max(left[1:] @ left[:-1] / (left @ left), 0.0), 0.95) if points > 2 else 0.0
+        fewer = (1.0 + correlation) / (1.0 - correlation)  # neighbours that err alike
+        expected.append(student.ppf(0.975, points - 1) * np.sqrt(fewer * left @ left / (points - 1) / (shape @ shape)))
+        found.append((fit.constants["c10"] - c10, fit.halves["c10"]))
+    np.testing.assert_allclose(np.array(found)[:, 0], 0.0, atol=1e-5 * MPA)
+    np.testing.assert_allclose(np.array(found)[:, 1], expected, rtol=1e-3)
+
+
+def test_as_many_points_as_constants_tell_no_interval():
+    stretch = np.array([1.0, 1.3, 1.8])
+    stress = 2.0 * (0.2 + 0.05 / stretch) * (stretch - stretch**-2) * MPA
+    fit = fit_candidate("mooney_rivlin", [made("uniaxial", stretch, stress)]).fit
+    assert fit.constants == pytest.approx({"c10": 0.2 * MPA, "c01": 0.05 * MPA}, rel=1e-3)
+    assert fit.halves == fit.deviations == {"c10": np.inf, "c01": np.inf}
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
+from scipy.special import stdtrit
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.material_tests.nominal_stress import MaterialTest, NominalStress, relative_error
@@ -37,8 +38,9 @@ class Fit:
     ----------
     material : the law with the constants found.
     constants : these by name, those of the Prony series included: `relative_modulus_1`, `time_1` (s) and so on.
-    deviations : standard deviations of the constants; infinite where the tests do not determine one, not a number where
-        one is at an end of its bounds.
+    deviations : standard deviations of the constants; infinite where the tests do not determine one, or leave nothing
+        that tells their scatter; not a number where one is at an end of its bounds.
+    halves : half the widths of 95 % intervals, which few points make wider (Student's t); not finite as the deviations.
     errors : root mean square difference over root mean square stress of each test.
     error : the root mean square of `errors`: each test counts alike.
     computed : the nominal stress (n,) of each test, Pa.
@@ -47,6 +49,7 @@ class Fit:
     material: Material
     constants: dict[str, float]
     deviations: dict[str, float]
+    halves: dict[str, float]
     errors: tuple[float, ...]
     error: float
     computed: tuple[Array, ...]
@@ -91,7 +94,8 @@ def fit_law(
 
     Every test counts alike: its differences are divided by its root mean square stress and by the root of its
     number of points. Standard deviations take the scatter from the differences that are left, and count points whose
-    differences have one sign for longer as fewer (`_effective_share`).
+    differences have one sign for longer as fewer (`_effective_share`). With as many points as
+    constants nothing is left.
 
     Parameters
     ----------
@@ -133,11 +137,11 @@ def fit_law(
     errors = tuple(relative_error(t.stress, c) for t, c in zip(tests, computed, strict=True))
     values = dict(zip(all_bounds, unknowns.values(best.x).tolist(), strict=True))
     inside = (best.x > _AT_END) & (best.x < 1.0 - _AT_END)
-    deviations = np.full(len(best.x), np.nan)
+    deviations, halves = np.full((2, len(best.x)), np.nan)
     slopes = best.jac[:, inside] / unknowns.slopes(best.x)[inside]
-    covariance = _covariance(slopes, best.fun, [len(t.stress) for t in tests])
-    moved = _series_slopes(values, n_terms)[:, inside]
-    deviations[inside] = _deviations(moved[inside], covariance)
+    parts, freedom = _covariances(slopes, best.fun, [len(t.stress) for t in tests])
+    moved = _series_slopes(values, n_terms)[np.ix_(inside, inside)]
+    deviations[inside], halves[inside] = _deviations(moved, parts, freedom)
     moduli = _moduli(values, n_terms)
     names = [_MODULUS + name.removeprefix(_SHARE) if name in moduli else name for name in all_bounds]
     constants = dict(zip(names, (values | moduli).values(), strict=True))
@@ -145,6 +149,7 @@ def fit_law(
         material=assembled(law, values, n_terms),
         constants=constants,
         deviations=dict(zip(names, deviations.tolist(), strict=True)),
+        halves=dict(zip(names, halves.tolist(), strict=True)),
         errors=errors,
         error=float(np.sqrt(np.mean(np.square(errors)))),
         computed=computed,
@@ -188,23 +193,33 @@ def _series_slopes(values: Mapping[str, float], n_terms: int) -> Array:
     return slopes
 
 
-def _deviations(slopes: Array, covariance: Array) -> Array:
-    """(k,) standard deviations of constants, to first order; infinite where the ``covariance`` (k, k) is.
+def _deviations(slopes: Array, parts: Array, freedom: Array) -> tuple[Array, Array]:
+    """Standard deviations (k,) of constants to first order, and half the widths (k,) of their 95 % intervals.
+
+    Both are infinite where the covariances are. The intervals are Student's; tests that each tell their own scatter
+    have the degrees of freedom of Satterthwaite (Biometrics Bulletin 2, 1946).
 
     Parameters
     ----------
-    slopes : (k, k) derivatives of the constants by those of the covariance.
-    covariance : of those that were searched for.
+    slopes : (k, k) derivatives of the constants by those of the covariances.
+    parts : (m, k, k) covariance of those that were searched for, by the scatter of each test.
+    freedom : (m,) degrees of freedom of each scatter.
     """
-    if not np.all(np.isfinite(covariance)):
-        return np.full(len(slopes), np.inf)
-    return np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+    if not np.all(np.isfinite(parts)):
+        return np.full(len(slopes), np.inf), np.full(len(slopes), np.inf)
+    variances = np.einsum("ka,mab,kb->mk", slopes, parts, slopes)
+    total = np.maximum(variances.sum(axis=0), np.finfo(float).tiny)
+    shares = variances / total
+    shown = 1.0 / np.maximum(np.sum(shares**2 / freedom[:, None], axis=0), np.finfo(float).tiny)
+    deviations = np.sqrt(total)
+    return deviations, deviations * stdtrit(shown, 0.975)
 
 
-def _covariance(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Array:
-    """(k, k) covariance of constants from what a fit left; infinite where the tests do not determine them.
+def _covariances(jacobian: Array, differences: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
+    """Covariance (m, k, k) of constants by the scatter of each test, and the degrees of freedom (m,) that show it.
 
-    Each test has its own scatter, so the covariance is the sandwich of White (Econometrica 48, 1980) by tests.
+    Covariances are infinite where the tests do not determine the constants, or leave nothing that shows a scatter.
+    Their sum is the sandwich of White (Econometrica 48, 1980) by tests.
 
     Parameters
     ----------
@@ -212,22 +227,26 @@ def _covariance(jacobian: Array, differences: Array, sizes: Sequence[int]) -> Ar
     differences : (n,) what is left.
     sizes : points of each test.
     """
-    n, k = jacobian.shape
+    k, ends = jacobian.shape[1], np.cumsum(sizes)
+    tests = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+    # Where no constant changes the stress, as at a stretch of one, a point tells nothing and nothing is left.
+    telling = np.any(jacobian != 0.0, axis=1)
+    counts, n = np.array([np.count_nonzero(telling[rows]) for rows in tests]), np.count_nonzero(telling)
+    # Constants take degrees of freedom from all tests in proportion to their points.
+    freedom = np.where(counts > 0, counts * (1.0 - k / max(n, 1)), np.inf)
     if k == 0:
-        return np.zeros((0, 0))
+        return np.zeros((len(sizes), 0, 0)), freedom
     scale = np.linalg.norm(jacobian, axis=0)
-    if not np.all(scale > 0.0) or np.linalg.matrix_rank(jacobian / scale) < k:
-        return np.full((k, k), np.inf)
+    if n <= k or not np.all(scale > 0.0) or np.linalg.matrix_rank(jacobian / scale) < k:
+        return np.full((len(sizes), k, k), np.inf), freedom
     scaled = jacobian / scale
     inverse = np.linalg.inv(scaled.T @ scaled)
-    meat = np.zeros((k, k))
-    ends = np.cumsum(sizes)
-    for start, end in zip(ends - sizes, ends, strict=True):
-        part, left = scaled[start:end], differences[start:end]
-        # Constants take degrees of freedom from all tests in proportion to their points.
-        variance = left @ left / max((end - start) * (1.0 - k / n), 1.0)
-        meat += variance / _effective_share(left) * part.T @ part
-    return inverse @ meat @ inverse / np.outer(scale, scale)
+    parts = np.zeros((len(sizes), k, k))
+    for part, rows, own in zip(parts, tests, freedom, strict=True):
+        left = differences[rows][telling[rows]]
+        variance = left @ left / own / _effective_share(left)
+        part[:] = variance * inverse @ (scaled[rows].T @ scaled[rows]) @ inverse / np.outer(scale, scale)
+    return parts, freedom
 
 
 def _effective_share(left: Array) -> float:

@@ -24,8 +24,6 @@ Array = NDArray[np.float64]
 DPI = 110
 #: The file by which a fit is known.
 RESULT = "fit.json"
-#: Two standard deviations of a normal distribution hold 95 %.
-_HALF_INTERVAL = 1.96
 #: Note a test that returns by more than this part of its strain while the law is elastic.
 _RETURNS = 0.1
 #: Note laws that differ by more than this where nothing was measured.
@@ -104,6 +102,7 @@ def _law_figures(each: FittedLaw) -> dict[str, Any]:
                 "name": name,
                 "value": value,
                 "standard_deviation": fit.deviations[name] if np.isfinite(fit.deviations[name]) else None,
+                "half_interval_95": fit.halves[name] if np.isfinite(fit.halves[name]) else None,
                 "at_bound": bool(np.isnan(fit.deviations[name])),
             }
             for name, value in fit.constants.items()
@@ -186,14 +185,13 @@ def _unstable(each: Mapping[str, Any]) -> str:
 
 
 def _constant_line(constant: Mapping[str, Any]) -> str:
-    name, value, deviation = constant["name"], constant["value"], constant["standard_deviation"]
+    name, value, half = constant["name"], constant["value"], constant["half_interval_95"]
     stress = not name.startswith(("exponent", "limit", "relative_modulus", "time"))
     scale, unit = (_MEGAPASCAL, " MPa") if stress else (1.0, " s" if name.startswith("time") else "")
     if constant["at_bound"]:
         return f"{name} = {value / scale:.4g}{unit}, at the end of its range"
-    if deviation is None:
-        return f"{name} = {value / scale:.4g}{unit}, not determined by these tests"
-    half = _HALF_INTERVAL * deviation
+    if half is None:
+        return f"{name} = {value / scale:.4g}{unit}, without an interval: too few points, or tests that do not tell it"
     low, weak = value - half, "; these tests hardly determine it" if half > abs(value) else ""
     if name.startswith(("modulus", "limit", "relative_modulus", "time")):
         low = max(low, 0.0)
