@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli import app as cli
-from morph_dslam.errors import EvaluationError, ModelFileError, MorphError, RegistrationError, StudyError, TrackingError
+from morph_dslam.errors import (
+    EvaluationError,
+    ExportError,
+    IdentificationError,
+    ModelFileError,
+    MorphError,
+    RegistrationError,
+    StudyError,
+    TrackingError,
+)
 from morph_dslam.evaluation.pixels import load_tracks
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
@@ -20,6 +29,7 @@ from morph_dslam.io.folders import make_run_folder, only_writer
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.state_choice import read_path
 from morph_dslam.io.trajectory import load_trajectory
+from morph_dslam.material_tests.tables import load_test
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.inp_writing import save_mesh
 from morph_dslam.model import load_model, save_model
@@ -33,6 +43,7 @@ from tests.support.block_study import STUDY, write_study
 from tests.support.documents import PROJECT
 from tests.support.run_folders import write_run
 from tests.support.small_models import block_model
+from tests.support.stretched_block import stretched_block_model
 
 BOARD = """
 kind = "grid"
@@ -172,6 +183,18 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     for name in ("file", "file/run"):
         with pytest.raises(TrackingError, match="cannot write the run to"):
             make_run_folder(tmp_path / name, overwrite=True)
+
+
+def test_decimals_with_commas_are_not_taken_for_other_numbers(tmp_path):
+    table = tmp_path / "table.csv"
+    for text, read, error in (
+        ("stretch,stress_MPa\n1,00,0,00\n1,05,0,06\n", load_test, IdentificationError),
+        ("frame,id,u,v\n0,a,512,31,204,77\n", load_tracks, EvaluationError),
+        ("slide [mm]\n1,5\n", lambda path: read_path(stretched_block_model(), path, np.zeros(2)), ExportError),
+    ):
+        table.write_text(text)
+        with pytest.raises(error, match=r"line 2.*decimals with points"):
+            read(table)
 
 
 def test_nothing_of_a_run_that_is_overwritten_stands_in_the_report_of_the_next(tmp_path):

@@ -62,6 +62,8 @@ def load_tracks(path: str | Path) -> PixelTracks:
     measured: dict[tuple[int, str], tuple[float, float]] = {}
     for line, row in rows:
         where = f"{path}, line {line}"
+        if any(row[len(header) :]):
+            raise EvaluationError(f"{where}: more cells than the {len(header)} titles; write decimals with points")
         frame, name, u, v = _measurement(where, row, columns)
         if (frame, name) in measured:
             raise EvaluationError(f"{where}: track '{name}' occurs twice in frame {frame}")

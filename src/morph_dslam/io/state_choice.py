@@ -222,6 +222,10 @@ def read_path(model: ReducedModel, path: Path, base: Array, in_camera: bool = Fa
     base = np.concatenate([base, np.zeros(model.n_loads)])
     states, taken = [], []
     for line, row in rows:
+        if any(row[len(header) :]):
+            raise ExportError(
+                f"{path}, line {line}: more cells than the {len(header)} titles; write decimals with points"
+            )
         texts = {k: _cell(row, column) for k, (column, _) in columns.items()}
         if not all(texts.values()):
             continue

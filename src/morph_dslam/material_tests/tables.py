@@ -36,8 +36,8 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
     Raises
     ------
     IdentificationError
-        If the file is missing, a column is missing or there twice, a unit is none, or a value is no number or cannot
-        be.
+        If the file is missing, a column is missing or there twice, a unit is none, a line has more cells than
+        titles, as decimals with commas make them, or a value is no number or cannot be.
     """
     path = Path(path)
     rows = read_csv(path, "material test", IdentificationError) or [(1, [""])]
@@ -46,6 +46,10 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
     stress, true, pascals = _stress_column(path, rows[0][1])
     time = [i for i, title in enumerate(rows[0][1]) if _splits_into(title, "time")]
     columns = [titles.index(strain), stress, *time[:1]]
+    if wide := [line for line, cells in rows[1:] if any(cells[len(titles) :])]:
+        raise IdentificationError(
+            f"{path}, line {wide[0]}: more cells than the {len(titles)} titles; write decimals with points"
+        )
     values = np.array([_numbers(path, line, cells, columns) for line, cells in rows[1:]]).reshape(-1, len(columns))
     values = values[np.isfinite(values).all(axis=1)]
     offset, factor = _STRAINS[strain]
