@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import main
+from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.depth import RIM_PX, DepthError, depth_error, read_depths, summarise_depth
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import plot_depth_errors_by_frame
@@ -95,6 +96,15 @@ def test_a_frame_whose_depth_is_all_of_something_else_is_counted_and_not_drawn(t
     figures = summarise_depth(error)
     assert figures["per_frame"]["0"] == {"n_points": 0, "left_out_percent": 100.0}
     assert figures["mean_mm"] == pytest.approx(np.arange(1, n_frames).mean())
+
+
+def test_depth_that_shows_the_object_in_the_base_frame_alone_is_refused(folder):
+    run = load_run(folder)
+    own, other = ((frame, depth) for frame, depth in read_depths(folder.parent / "depth.h5", [10, 11]))
+    behind = (other[0], other[1] + 0.5 * np.linalg.norm(np.ptp(run.model.nodes, axis=0)))
+    with pytest.raises(EvaluationError, match="but the base frame 10"):
+        depth_error(run, [own, behind], base_frame=10)
+    assert len(depth_error(run, [own, behind]).compared) > 0
 
 
 @pytest.mark.parametrize(

@@ -204,14 +204,16 @@ def depth_error(
         frames.append(frame)
         distances.append(distance[kept])
         # A new tree in each frame: one that is not balanced is made faster.
-        _, found = KDTree(surface[surface_nodes], balanced_tree=False).query(points[kept])
-        nearest.append(surface_nodes[found])
-    _check(frames, distances, base_frame)
-    return DepthError(np.array(frames), distances, nearest, gate, np.array(left_out), base_frame)
+        _, closest = KDTree(surface[surface_nodes], balanced_tree=False).query(points[kept])
+        nearest.append(surface_nodes[closest])
+    found = DepthError(np.array(frames), distances, nearest, gate, np.array(left_out), base_frame)
+    _check(found)
+    return found
 
 
-def _check(frames: list[int], distances: list[Array], base_frame: int | None) -> None:
-    if not any(len(distance) for distance in distances):
+def _check(error: DepthError) -> None:
+    frames, base_frame = error.frames, error.base_frame
+    if not any(len(distance) for distance in error.distances):
         raise EvaluationError(
             "the depth images show nothing of the estimated surface in any tracked frame: are their numbers those "
             "of the run's frames, and their depths in the unit given?"
@@ -219,6 +221,11 @@ def _check(frames: list[int], distances: list[Array], base_frame: int | None) ->
     if base_frame is not None and base_frame not in frames:
         raise EvaluationError(
             f"the base frame {base_frame} was not tracked or has no depth; compared were {frames[0]} to {frames[-1]}"
+        )
+    if not len(error.compared):
+        raise EvaluationError(
+            f"the depth images show nothing of the estimated surface in any tracked frame but the base frame "
+            f"{base_frame}: all else they show is more than {1e3 * error.gate:.3g} mm from it"
         )
 
 
