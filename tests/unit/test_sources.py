@@ -13,7 +13,7 @@ from morph_dslam.errors import SourceError
 from morph_dslam.extend import register_source
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
-from morph_dslam.sources.frames import check_range, notes_of_source
+from morph_dslam.sources.frames import check_range, notes_of_source, read_image
 from tests.support.full_disk import largest_file
 from tests.support.real_data import ROOT, real_data
 
@@ -601,3 +601,17 @@ def test_mistakes_of_a_registered_source_are_named(opened, message, n_before, tm
     assert len(before) == n_before
     if type(opened) is Items:
         assert [frame.index for frame in open_stream(tmp_path / "film.any")] == [0]
+
+
+def test_a_picture_before_a_short_video_is_whole_and_one_behind_a_preview_may_be_cut_short(tmp_path):
+    picture = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    preview = b"\xff\xe1" + (2 + len(data)).to_bytes(2, "big") + data
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(data + b"\0\0\0\x18ftypmp42" + bytes(5000))
+    np.testing.assert_array_equal(read_image(path, "photo"), cv2.imdecode(np.frombuffer(data, np.uint8), 1))
+    path.write_bytes(data[:2] + preview + data[2:])
+    assert read_image(path, "photo").shape == picture.shape
+    path.write_bytes(data[:2] + preview + data[2 : len(data) // 2])
+    with pytest.raises(SourceError, match="is cut short"):
+        read_image(path, "photo")

@@ -19,7 +19,7 @@ from morph_dslam.io.file_kinds import IMAGES, content_kind, file_kind, named_kin
 
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
-#: The bytes with which a complete file of this kind ends; the decoder itself fills what is missing with grey.
+#: The bytes with which a complete picture of this kind ends; the decoder itself fills what is missing with grey.
 _END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9"}
 
 
@@ -232,12 +232,22 @@ def _decode(path: Path, what: str, flags: int) -> NDArray:
     except OSError as error:
         raise SourceError(f"{what}: cannot read {path}: {error.strerror}") from error
     marker = _END_MARKERS.get(content_kind(data) or "")
-    if marker and marker not in data[-1024:]:
+    # Behind the picture more may follow: phones put a short video there.
+    if marker and data.find(marker, _start_of_scan(data) if marker == _END_MARKERS[".jpg"] else 0) < 0:
         raise SourceError(f"{what}: {path} is cut short: copy it again")
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     if image is None:
         raise SourceError(f"{what}: {path} cannot be decoded as an image")
     return np.asarray(image)
+
+
+def _start_of_scan(data: bytes) -> int:
+    """Where the first scan of a JPEG file begins (ITU T.81, B.1.1): segments before it may hold a preview."""
+    place = 2
+    while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
+        is_fill = data[place + 1 : place + 2] == b"\xff"
+        place += 1 if is_fill else 2 + max(int.from_bytes(data[place + 2 : place + 4], "big"), 2)
+    return place
 
 
 #: How long a camera on the network may take to answer, and then for a frame, milliseconds.
