@@ -1,7 +1,9 @@
 """Fits to material tests: closed forms, finite elements, published constants, scatter of draws, stability, tables."""
 
 import json
+import os
 import re
+import sys
 import tomllib
 from functools import partial
 
@@ -20,6 +22,7 @@ from morph_dslam.extend.material_tests import (
     fit_law,
     load_test,
     recommended,
+    write_fit,
 )
 from morph_dslam.material_tests.stability import first_unstable_stretches
 from morph_dslam.mechanics.materials.isotropic import ArrudaBoyce, Gent, MooneyRivlin, Ogden, Yeoh
@@ -415,3 +418,13 @@ def test_nothing_to_fit_is_refused(tmp_path, capsys):
     assert "given twice" in capsys.readouterr().err
     assert main(["fit", "--uniaxial", str(path), "--law", "hooke", "-o", str(tmp_path)]) == 2
     assert "'hooke' is no law that can be fitted; give neo_hookean" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text")
+def test_a_file_whose_name_is_no_text_can_be_fitted(tmp_path):
+    path = tmp_path / os.fsdecode(b"Pr\xfcfung.csv")
+    path.write_text("stretch,stress_MPa\n1.2,0.1\n1.5,0.2\n1.8,0.3\n")
+    test = load_test(path)
+    write_fit(tmp_path / "fit", [fit_candidate("neo_hookean", [test])], [test], "rubber")
+    assert "Pr?fung.csv" in (tmp_path / "fit" / "material.toml").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "fit" / "fit.json").read_text())["tests"][0]["name"] == "Pr?fung.csv"

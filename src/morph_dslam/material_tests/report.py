@@ -58,9 +58,11 @@ def write_fit(
     figures = summarise(fitted, tests)
     with writing(IdentificationError, folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / RESULT).write_text(json.dumps(figures, indent=2) + "\n")
-        (folder / "material.toml").write_text(section_text(recommended(fitted, tests), tests, name))
+        section = section_text(recommended(fitted, tests), tests, name)
+        (folder / "material.toml").write_text(section, encoding="utf-8")
         _draw(folder / "fit.png", fitted, tests)
+        # The last one: by it a fit is known.
+        (folder / RESULT).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return figures
 
 

@@ -61,7 +61,9 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
         )
     seconds = None if not time else values[:, 2] * _factor(path, rows[0][1][time[0]], "time")
     nominal = pascals * values[:, 1] / (stretch if true else 1.0)
-    return MaterialTest(path.name, stretch, nominal, seconds, kind)
+    # A file's name may hold bytes that are no text, which cannot be written.
+    name = path.name.encode(errors="replace").decode()
+    return MaterialTest(name, stretch, nominal, seconds, kind)
 
 
 def _only(path: Path, titles: Sequence[str], found: Sequence[str], what: str) -> str:
