@@ -517,3 +517,11 @@ def test_a_model_without_parameters_has_no_path(tmp_path, refused):
 def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, refused):
     (tmp_path / "file").write_text("")
     assert "cannot write to" in refused("export", folder / "block.morph", "-o", tmp_path / "file" / "out")
+
+
+def test_an_earlier_export_of_a_model_with_an_ampersand_is_replaced(tmp_path):
+    file = tmp_path / "R&D.morph"
+    save_model(file, stretched_block_model())
+    for count in (6, 2):
+        export(file, tmp_path / "out", "vtu", StateChoice(vary=[f"slide=-1:1:{count}"]))
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.vtu")) == ["R&D_0000.vtu", "R&D_0001.vtu"]

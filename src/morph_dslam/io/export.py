@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, get_args
 from xml.etree import ElementTree
+from xml.sax.saxutils import escape, unescape
 
 import meshio
 import numpy as np
@@ -137,10 +138,8 @@ def _remove_export(folder: Path, stem: str) -> None:
     Files that others have written under these names are left alone.
     """
     series, collection, animation = (folder / f"{stem}.{ending}" for ending in ("xdmf", "pvd", "glb"))
-    written = [
-        folder / name
-        for name in re.findall(rf'file="({re.escape(stem)}_(?:{_INNER}\w+_)?\d{{4,}}\.vtu)"', _beginning(collection))
-    ]
+    own = rf'file="({re.escape(escape(stem))}_(?:{_INNER}\w+_)?\d{{4,}}\.vtu)"'
+    written = [folder / unescape(name) for name in re.findall(own, _beginning(collection))]
     found = [*written, collection] if written else []
     head = _beginning(series, _HEAD)
     if _XDMF_SERIES in head and f">{stem}.h5:/" in head:

@@ -81,7 +81,6 @@ def load_trajectory(path: str | Path) -> Trajectory:
     not found, and CameraError if it does not say where it is on the body.
     """
     path = Path(path)
-    path = Path(path)
     if path.is_dir():
         return _make(path, _seven_scenes_rows(path))
     lines = read_text(path, "trajectory", TrajectoryError).splitlines()
