@@ -317,6 +317,7 @@ HEADER = "state,place_x_mm,place_y_mm,place_z_mm,x_mm,y_mm,z_mm\n"
         (HEADER + "one,0,0,0,,,\n", "no point was measured"),
         ("load_N," + HEADER + "1,one,0,0,0,1,1,1\n", "'load_N' is no parameter"),
         ("b_1," + HEADER + ",one,0,0,0,1,1,1\n", "column 'b_1' is empty"),
+        ("b_1,b [1]," + HEADER + "0.5,0.2,one,0,0,0,1,1,1\n", r"b_1 and b \[1\] both hold b"),
     ],
 )
 def test_wrong_tables_are_refused(tmp_path: Path, content: str, said: str) -> None:

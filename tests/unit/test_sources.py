@@ -615,3 +615,9 @@ def test_a_picture_before_a_short_video_is_whole_and_one_behind_a_preview_may_be
     path.write_bytes(data[:2] + preview + data[2 : len(data) // 2])
     with pytest.raises(SourceError, match="is cut short"):
         read_image(path, "photo")
+
+
+def test_a_list_of_images_that_is_no_text_is_named(tmp_path):
+    (tmp_path / "rgb.txt").write_bytes("# Gerät\n1.0 a.png\n".encode("latin-1"))
+    with pytest.raises(SourceError, match=r"rgb\.txt is not a text file"):
+        open_source(tmp_path)

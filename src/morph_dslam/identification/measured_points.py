@@ -223,6 +223,11 @@ def load_points(path: str | Path, model: ReducedModel, aligned: bool = False) ->
     """
     table = _PointTable(path)
     known = {title: _parameter(path, title, model) for title in table.titles if _name(title) not in OWN}
+    for name in {name for name, _ in known.values()}:
+        if len(twins := [title for title, (other, _) in known.items() if other == name]) > 1:
+            raise IdentificationError(
+                f"{path}: the columns {' and '.join(twins)} both hold {name}: leave one of them in"
+            )
     places, measured = (table.coordinates(names) for names in (PLACE, MEASURED))
     if not np.isfinite(places).all():
         raise IdentificationError(f"{path}: every row needs {', '.join(PLACE)}")

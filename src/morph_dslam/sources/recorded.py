@@ -13,6 +13,7 @@ import numpy as np
 
 from morph_dslam.errors import SourceError
 from morph_dslam.io.file_kinds import IMAGES, named_kind
+from morph_dslam.io.text import read_text
 from morph_dslam.sources.frames import (
     ASSUMED_FPS,
     DepthScale,
@@ -266,7 +267,7 @@ def tum_recording(folder: Path, first: int | None = None, last: int | None = Non
 def _read_tum_list(path: Path) -> list[tuple[float, Path]]:
     """Timestamps and files of a list "timestamp file", in the order of time."""
     entries = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for number, line in enumerate(read_text(path, "list of images", SourceError).splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -308,7 +309,7 @@ def _read_euroc_list(camera: Path) -> dict[int, Path]:
     """The images of a camera by their timestamps in nanoseconds, which float64 seconds would round."""
     entries = {}
     path = camera / "data.csv"
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for number, line in enumerate(read_text(path, "list of images", SourceError).splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
             continue
         words = [word.strip() for word in line.split(",")]
