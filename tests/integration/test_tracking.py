@@ -202,9 +202,12 @@ def test_where_a_clock_tells_the_time_other_deviations_have_the_mesh_error_of_a_
     film = SheetFilm(model)
     arch, *others = model.parameters
     time = Parameter(arch.name, "time", "s", arch.lower, arch.upper, arch.default)
-    first, sizes, none = others[0], {"displacement_rms_mm": [1.0], "left_rms_mm": [0.0]}, {arch.name: [0.0]}
-    stated = {"errors": none | {first.name: [5e-3]}} | sizes
-    stated |= {"at_known_time": {"errors": none | {first.name: [1e-5]}} | sizes}
+    slopes = model.displacement.value_and_sensitivities(sheet_state(0.1).parameters)[1][:, np.unique(model.triangles)]
+    square = float(np.mean(np.sum(slopes[1] ** 2, axis=1)))
+    # What 1e-5 of the time moves, 499 times as much of the other parameter does.
+    products = square * np.array([[1e6, -499.0], [-499.0, 1.0]])
+    stated = {"errors": {arch.name: [1e-5], others[0].name: [5e-3]}, "displacement_rms_mm": [1.0], "left_rms_mm": [0.0]}
+    stated["products_m2"] = [products.tolist()]
     timed = replace(model, parameters=(time, *others), certificate={"discretisation": {"parameters": stated}})
     deviations = []
     for known in (False, True):

@@ -169,16 +169,18 @@ def test_what_a_result_rests_on_is_said() -> None:
 
 
 def test_an_error_of_the_shape_is_one_of_the_parameters_that_are_not_known() -> None:
-    """At 0.5 m of displacement the mesh errs as a and b together; b is known, and where points see it a makes it good.
+    """At 0.5 m of displacement the mesh errs as a and b together; b is known, so that a makes the error good alone.
 
-    The displacement is (0.3, 0.25) m where a = 0.3 and c = 0.5, where b moves nothing.
+    There a moved the surface by half a metre for each of its units, and b by a fifth of that along it: so a makes good
+    0.04. The displacement is (0.3, 0.25) m where a = 0.3 and c = 0.5; a moves it by a metre there, and half will do.
     """
     errors = {"a": [0.02], "b": [0.1], "c": [0.0]}
-    entry = {"errors": errors, "displacement_rms_mm": [500.0], "left_rms_mm": [0.0]}
+    products = [[[0.25, 0.05, 0.0], [0.05, 0.02, 0.0], [0.0, 0.0, 0.0]]]
+    entry = {"errors": errors, "displacement_rms_mm": [500.0], "left_rms_mm": [0.0], "products_m2": products}
     model = stating({"discretisation": {"parameters": entry}})
     table = replace(points_at([0.3] * 4, 1e-4, {"b": np.full(16, 0.5)}), model=model)
     found = identify(model, [table], ["a"])
-    assert found["a"].model_std == pytest.approx(0.02 * np.hypot(0.3, 0.25) / 0.5, rel=1e-3)
+    assert found["a"].model_std == pytest.approx(0.5 * 0.04 * np.hypot(0.3, 0.25) / 0.5, rel=1e-3)
     assert found["a"].std == pytest.approx(found["a"].model_std, rel=1e-2)
 
 

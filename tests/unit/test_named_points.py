@@ -213,7 +213,7 @@ def test_rotations_and_their_deviations_are_those_of_another_library():
 def test_the_models_own_error_is_in_a_rotations_deviation():
     """A body that is turned by w about each axis is displaced by sqrt(2) w times its radius of gyration."""
     exact = in_frame(MODEL, STATE, np.zeros((3, 3)))
-    wrong = replace(exact.estimate, by_model=ModelDeviation(np.zeros((3, 3)), 0.0, 1e-3))
+    wrong = replace(exact.estimate, by_model=ModelDeviation(np.zeros((3, 3)), np.zeros((3, 3)), 0.0, 1e-3))
     (found,) = run_of(MODEL, [CORNER], replace(exact, estimate=wrong)).point_turns()["corner"]
     away = MODEL.nodes - MODEL.nodes.mean(axis=0)
     about = [Rotation.from_rotvec(1e-6 * axis).apply(away) - away for axis in np.eye(3)]

@@ -134,19 +134,19 @@ def test_a_known_parameter_gets_no_deviation(model, certified):
 
 
 def test_others_make_good_what_a_sensor_keeps_a_parameter_from(model, certified):
-    """The slide is held at a sensor's value; 30 m^-1 of its errors are taken up by the stretch."""
-    stretch, slide = 0.06, 0.004
-    plain, held = tracked_result(model, stretch, slide), np.zeros((8, 2))
-    held[:2, 1] = [-30.0, 1.0]
+    """Where the slide has a sensor's value, the stretch comes as near to the finer shapes as it alone can."""
+    plain, held = tracked_result(model, 0.06, 0.004), np.zeros((8, 2))
+    held[1, 1] = 1.0
     found = with_model_errors(plain, ModelErrors.of(certified), held)
+    x, z = model.nodes[np.unique(model.triangles)].T[[0, 2]]
+    alone = [(d[0] * x + d[1] * z / SIZE[2]) @ x / (x @ x) for d in MEANT - STATES]
 
     def size(mu):
         return np.sqrt(np.mean(np.sum(displacement(model, mu) ** 2, axis=1)))
 
-    errors = (MEANT - STATES) * (size([stretch, slide]) / np.array([size(meant) for meant in MEANT]))[:, None]
-    left = np.column_stack([errors[:, 0] + 30.0 * errors[:, 1], np.zeros(2)])
+    shares = np.array(alone) * size([0.06, 0.004]) / np.array([size(meant) for meant in MEANT])
     expected = plain.covariance.copy()
-    expected[:2, :2] += left.T @ left / 2.0
+    expected[0, 0] += np.mean(shares**2)
     assert found.covariance == pytest.approx(expected, rel=1e-9)
 
 
@@ -174,6 +174,19 @@ def test_the_shape_errs_by_what_a_sensor_keeps_from_it(model, certified):
     assert np.linalg.eigvalsh(apart).min() > -1e-12 * np.trace(apart)
 
 
+def test_what_something_else_tells_half_way_is_taken_half_way(model, certified):
+    """Errors of a slide that is kept from half of its change lie half way between those of a known and a free one."""
+    errors, one = ModelErrors.of(certified), np.array([1])
+    assert errors is not None
+    assert errors.mesh is not None
+    free, half, full = (
+        each.errors for each in (errors.mesh, errors.mesh.holding(one, np.array([[0.5]])), errors.mesh.holding(one))
+    )
+    assert free == pytest.approx(MEANT - STATES, rel=1e-9)
+    assert half == pytest.approx((free + full) / 2.0, rel=1e-9)
+    assert not full[:, 1].any()
+
+
 def test_where_the_time_is_known_the_other_parameters_alone_make_the_error_good(model):
     """The slide is the time: the stretch that comes nearest to the finer shape is a projection."""
     slide = model.parameters[1]
@@ -187,17 +200,14 @@ def test_where_the_time_is_known_the_other_parameters_alone_make_the_error_good(
     x = model.nodes[np.unique(model.triangles), 0]
     errors = [(finer - own)[np.unique(model.triangles), 0] for _, own, finer in states]
     stretches = np.array([x @ error / (x @ x) for error in errors])
-    known = entry["at_known_time"]
-    assert known["errors"]["stretch"] == pytest.approx(stretches, rel=1e-9)
-    assert known["errors"]["slide"] == [0.0, 0.0]
-    left = [1e3 * np.sqrt(np.mean((error - s * x) ** 2)) for error, s in zip(errors, stretches, strict=True)]
-    assert known["left_rms_mm"] == pytest.approx(left, rel=1e-6)
-    assert "at_known_time" not in parameter_errors(model, states), "no parameter of it is a time"
-
+    left = [np.sqrt(np.mean((error - s * x) ** 2)) for error, s in zip(errors, stretches, strict=True)]
     mu, found = np.array([0.06, 0.004]), ModelErrors.of(timed)
     assert found is not None
     sizes = [np.sqrt(np.mean(np.sum(displacement(model, each) ** 2, axis=1))) for each in (mu, *MEANT)]
     expected = np.mean((stretches * sizes[0] / sizes[1:]) ** 2)
-    assert found.where_known(np.array([1])).at(mu).parameters == pytest.approx(np.diag([expected, 0.0]), rel=1e-9)
+    known = found.where_known(np.array([1])).at(mu)
+    assert known.parameters == pytest.approx(np.diag([expected, 0.0]), rel=1e-9)
+    share = np.sqrt(np.mean((np.array(left) / sizes[1:]) ** 2))
+    assert known.displacement == pytest.approx(share * sizes[0], rel=1e-6)
     for others in ([], [0]):
         assert found.where_known(np.array(others, dtype=int)).at(mu).parameters[1, 1] > 0.0

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from morph_dslam.evaluation.report import Table
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.functions import ParameterFunctions
-from morph_dslam.model.parameter_errors import ENTRY, ERRORS
+from morph_dslam.model.parameter_errors import ENTRY, ERRORS, PRODUCTS, errors_alone
 from morph_dslam.model.stated_errors import NOT_ESTIMATED
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions, TensorTrainFunctions, TuckerFunctions
 
@@ -110,6 +110,9 @@ def error_facts(model: ReducedModel) -> Facts:
     }
     if ENTRY in discretisation:
         facts["as errors of the parameters"] = _as_parameters(model, discretisation[ENTRY][ERRORS])
+        if PRODUCTS in discretisation[ENTRY] and len(model.study_parameters) > 1:
+            alone = errors_alone(discretisation[ENTRY])
+            facts["of each where the others are known"] = _as_parameters(model, alone)
     if discretisation.get("singular_nodes"):
         facts["nodes left out"] = (
             f"strain and stress at up to {discretisation['singular_nodes']} nodes, where cells of the finer solution "

@@ -30,7 +30,7 @@ from morph_dslam.identification.prior import KnownValues
 from morph_dslam.identification.scatter import Design, Noise, Scatter, directions, joint_labels, wider, without
 from morph_dslam.identification.values import FACTOR, Values
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.tracking.flat_sides import LOOK, flat_variance
+from morph_dslam.tracking.flat_sides import FLAT_SHARE, LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 
 if TYPE_CHECKING:
@@ -314,8 +314,8 @@ class _Fit:
             )
         residuals = self._residuals(theta)
         spread = self._spread(theta, residuals, by_model, by_run)
-        alike = self._alike(theta, jacobian, float(residuals @ residuals), spread)
-        estimates = self._estimates(theta, spread, at_bound, alike)
+        alike, is_flat = self._alike(theta, jacobian, float(residuals @ residuals), spread)
+        estimates = self._estimates(theta, spread, at_bound, alike, is_flat)
         std = np.sqrt(np.diag(spread.covariance))
         products = np.outer(std, std)
         # What is fitted without any error has no deviation.
@@ -337,30 +337,37 @@ class _Fit:
                         "a wider one, or give what was measured at less load"
                     )
 
-    def _alike(self, theta: Array, jacobian: Array, least: float, spread: _Spread) -> Array:
+    def _alike(self, theta: Array, jacobian: Array, least: float, spread: _Spread) -> tuple[Array, NDArray[np.bool_]]:
         """How far (k, 2) below and above each estimate its range has values that fit nearly as well as ``least``.
 
         The way of a body that does not touch yet may be anything up to the contact. There the sum of squares rises by
-        less than the derivatives say it does two standard deviations away.
+        less than the derivatives say it does two standard deviations away. Where it rises by much less there, the
+        derivatives do not hold: the side (k, 2) is flat, and not only curved.
         """
-        found = np.zeros((len(theta), 2))
+        found, is_flat = np.zeros((len(theta), 2)), np.zeros((len(theta), 2), dtype=bool)
         for i, away in enumerate(LOOK * np.sqrt(np.diag(spread.covariance))):
             rise = float(np.sum((away * jacobian[:, i]) ** 2))
-            for value in np.linspace(0.0, 1.0, PLACES):
+
+            def risen(value: float, i: int = i) -> float:
                 there = np.where(np.arange(len(theta)) == i, value, theta)
-                if abs(value - theta[i]) > away and np.sum(self._residuals(there) ** 2) < least + rise:
+                return float(np.sum(self._residuals(there) ** 2)) - least
+
+            for side, near in enumerate((theta[i] - away, theta[i] + away)):
+                is_flat[i, side] = 0.0 <= near <= 1.0 and risen(near) < FLAT_SHARE * rise
+            for value in np.linspace(0.0, 1.0, PLACES):
+                if abs(value - theta[i]) > away and risen(value) < rise:
                     side = int(value > theta[i])
                     found[i, side] = max(found[i, side], abs(value - theta[i]))
-        return found
+        return found, is_flat
 
     def _estimates(
-        self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_], alike: Array
+        self, theta: Array, spread: _Spread, at_bound: NDArray[np.bool_], alike: Array, is_flat: NDArray[np.bool_]
     ) -> tuple[Estimate, ...]:
-        """Those with values that fit ``alike`` (k, 2) have wider intervals."""
+        """Those with values that fit ``alike`` (k, 2) have wider intervals, and deviations on sides that are flat."""
         std, model, run = (np.sqrt(np.diag(part)) for part in (spread.covariance, spread.model, spread.run))
         below, above = np.maximum(spread.half[:, None], alike).T
         low, high, value = self._si(theta - below), self._si(theta + above), self._si(theta)
-        std = np.sqrt(std**2 + flat_variance(alike.max(axis=1)))
+        std = np.sqrt(std**2 + flat_variance((alike * is_flat).max(axis=1)))
         # Over the factor's logarithm a deviation is a relative one.
         slope = np.where(self._log, value, 1.0) * np.diff(self._ends, axis=1)[:, 0]
         return tuple(

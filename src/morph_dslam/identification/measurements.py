@@ -24,6 +24,8 @@ class Unknowns(Protocol):
 
     factor: float
     """Common factor of all moduli."""
+    free: frozenset[str]
+    """Names of the model's parameters that they change."""
 
     def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
         """The model's parameters (d,), SI, where those that are not identified are known.

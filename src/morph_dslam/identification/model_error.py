@@ -2,12 +2,12 @@
 
 A certificate has which changes of the parameters move the surface as these errors do. They are predicted as errors of
 points, and least squares turn them into errors of what is identified: points see a modulus otherwise where a stroke is
-known than where it is not. Errors of all states belong together.
+known than where it is not. Parameters that are not identified make nothing good. Errors of all states belong together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,9 @@ Vector = Callable[[Mapping[str, float]], Array]
 STEP = 1e-4
 
 
-def shape_errors(model: ReducedModel, positions: Callable[[Vector], Array], vector: Vector) -> Array:
+def shape_errors(
+    model: ReducedModel, positions: Callable[[Vector], Array], vector: Vector, free: Collection[str]
+) -> Array:
     """Errors (e, r, 3) of modelled points, m, independent of each other; as large as likely, of either sign.
 
     Parameters
@@ -29,10 +31,13 @@ def shape_errors(model: ReducedModel, positions: Callable[[Vector], Array], vect
     model : whose errors they are; without any that are stated, e is 0.
     positions : where the model has the points (r, 3), m, if a function makes its parameters (d,) of the known ones.
     vector : such a function, with what is identified.
+    free : names of the parameters that the fit may change; without any all count as such.
     """
     errors = ModelErrors.of(model)
     if errors is None:
         return np.zeros((0, *positions(vector).shape))
+    if free:
+        errors = errors.holding(np.array([k for k, p in enumerate(model.parameters) if p.name not in free], dtype=int))
     ranges = model.upper - model.lower
     changes: dict[bytes, Array] = {}
 

@@ -25,6 +25,7 @@ class Values:
 
     Attributes
     ----------
+    free : names of the model's parameters that the unknowns change.
     beyond : values, SI, of parameters that such a division has taken out of their ranges, by name.
     """
 
@@ -33,6 +34,7 @@ class Values:
     ) -> None:
         self._model, self._scaled = model, scaled
         self._own = {p.name: float(value) for p, value in zip(unknowns, theta, strict=True)}
+        self.free = frozenset(self._own).difference([FACTOR]) | frozenset(scaled if FACTOR in self._own else ())
         self.factor = self._own.pop(FACTOR, 1.0)
         self.beyond: dict[str, list[float]] = {}
 

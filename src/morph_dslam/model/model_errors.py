@@ -25,14 +25,20 @@ class ModelDeviation:
 
     Attributes
     ----------
-    parameters : (d, d) to the parameters' covariance, SI.
+    by_mesh, by_reduction : (d, d) to the parameters' covariance, SI.
     displacement : to the displacement, root mean square length, metres.
     in_object : to the displacement in the object's frame, where what the pose makes good is an error too.
     """
 
-    parameters: Array
+    by_mesh: Array
+    by_reduction: Array
     displacement: float
     in_object: float
+
+    @property
+    def parameters(self) -> Array:
+        """To the parameters' covariance (d, d), SI."""
+        return self.by_mesh + self.by_reduction
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class ModelErrors:
     constant : (d,) which parameters are found from all frames together.
     n_loads : unknown loads among the last parameters; the reduction adds nothing to them.
     clocks : numbers of the parameters that may be the time.
-    others : as ``mesh``, by whether the time is known and whether the pose is free.
+    others : as ``mesh``, by whether the pose is free.
     has_time : whether the time is known, so that it makes no error good.
     """
 
@@ -55,7 +61,7 @@ class ModelErrors:
     constant: NDArray[np.bool_]
     n_loads: int
     clocks: tuple[int, ...] = ()
-    others: dict[tuple[bool, bool], ParameterErrors | None] = field(default_factory=dict)
+    others: dict[bool, ParameterErrors | None] = field(default_factory=dict)
     has_time: bool = False
 
     @classmethod
@@ -66,37 +72,43 @@ class ModelErrors:
             return None
         kept = np.array([parameter.name in constant for parameter in model.parameters], dtype=bool)
         products = None if mesh is None else mesh.products
-        others = {
-            (time, pose): ParameterErrors.of(model, time, pose, products)
-            for time in (False, True)
-            for pose in (False, True)
-        }
+        others = {False: mesh, True: ParameterErrors.of(model, True, products)}
         return cls(mesh, reduction, kept, model.n_loads, model.clocks, others)
 
     def where_known(self, known: NDArray[np.int64], free_pose: bool = False) -> ModelErrors:
-        """The same where parameters are known and the pose is free, or not.
+        """The same where a clock may tell the time, and the pose is free, or not.
 
         Parameters
         ----------
-        known : (k,) numbers of the parameters that are, by a clock or by sensors.
+        known : (k,) numbers of the parameters that clocks or sensors tell.
         free_pose : whether the images alone tell the pose.
         """
         has_time = len(self.clocks) == 1 and self.clocks[0] in known
-        return replace(self, mesh=self.others[has_time, free_pose], has_time=has_time)
+        mesh = self.others[free_pose]
+        if mesh is not None and has_time:
+            mesh = mesh.holding(np.array(self.clocks))
+        return replace(self, mesh=mesh, has_time=has_time)
+
+    def holding(self, known: NDArray[np.int64], shares: Array | None = None) -> ModelErrors:
+        """The same where something else tells parameters, and the others make the mesh's error good.
+
+        ``known`` and ``shares`` are as of `ParameterErrors.holding`.
+        """
+        return self if self.mesh is None else replace(self, mesh=self.mesh.holding(known, shares))
 
     def at(self, mu: Array, followed: bool = True) -> ModelDeviation:
         """In the state ``mu`` (d,), SI; ``followed`` as in `ReductionErrors.covariance`."""
-        covariance, squared, in_object = np.zeros((len(mu), len(mu))), 0.0, 0.0
+        by_mesh, by_reduction, squared, in_object = *np.zeros((2, len(mu), len(mu))), 0.0, 0.0
         if self.mesh is not None:
-            of_parameters, left, with_pose = self.mesh.at(mu)
-            covariance, squared, in_object = covariance + of_parameters, left**2, with_pose**2
+            by_mesh, left, with_pose = self.mesh.at(mu)
+            squared, in_object = left**2, with_pose**2
         if self.reduction is not None:
             own, known = len(mu) - self.n_loads, np.zeros(len(mu), dtype=bool)
             known[list(self.clocks)] = self.has_time
-            covariance[:own, :own] += self.reduction.covariance(mu[:own], self.constant[:own], known[:own], followed)
-            by_reduction = self.reduction.size_at(mu[:own]) ** 2
-            squared, in_object = squared + by_reduction, in_object + by_reduction
-        return ModelDeviation(covariance, float(np.sqrt(squared)), float(np.sqrt(in_object)))
+            by_reduction[:own, :own] = self.reduction.covariance(mu[:own], self.constant[:own], known[:own], followed)
+            size = self.reduction.size_at(mu[:own]) ** 2
+            squared, in_object = squared + size, in_object + size
+        return ModelDeviation(by_mesh, by_reduction, float(np.sqrt(squared)), float(np.sqrt(in_object)))
 
     def in_common(self, mu: Array) -> tuple[Array, float]:
         """What is alike in all states: errors (d, k) of the parameters, SI, and of the displacement, as of `at`."""

@@ -2,13 +2,17 @@
 
 Elements that are too coarse are too stiff, so that an object seen in a shape needs more load in the model than in
 truth. The parameters that bring the model's surface nearest to that of finer elements say how much. A certificate has
-this at the states that were solved again; in others it is taken to be as much for each millimetre of displacement.
+this at the states that were solved again. In others what each parameter moves of the surface for it is taken to be as
+much for each millimetre of displacement: a load then errs in proportion to this, and a modulus by a constant share.
+
+Parameters that move the surface nearly alike, as a load and a modulus do, may change by a lot of opposite sign, and do
+so where the images alone tell both. Where something else tells one, the others make the error good without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +30,8 @@ WITH_LOADS = "with_unknown_loads"
 #: Within each of them those where the pose is free: it makes good what is nearly a rigid motion, by which the
 #: displacement in the object's frame is then off.
 WITH_FREE_POSE, IN_OBJECT = "with_free_pose", "in_object_rms_mm"
-#: And those of a model whose time a clock tells, so that the other parameters alone make the error good.
-AT_KNOWN_TIME = "at_known_time"
+#: And mean products of what two parameters move the surface by, from which follows what others make good without one.
+PRODUCTS = "products_m2"
 #: Unknown loads are found from a surface that is measured to this part of the object's extent, by many points.
 MEASURED = 1e-5
 #: Combinations of parameters that move the surface by less than this part of what others do are left out.
@@ -43,16 +47,17 @@ class EquivalentErrors:
     changes : (d,) of the parameters, SI.
     left : of the error on the surface, root mean square length, metres.
     in_object : as ``left``, with what the pose makes good of it: in the object's frame that is an error.
+    products : (d, d) mean products of what the parameters move the surface by, but for what the pose makes good, square
+        metres over both units. Likely unknown loads are in it.
     """
 
     changes: Array
     left: float
     in_object: float
+    products: Array
 
 
-def equivalent_errors(
-    model: ReducedModel, mu: Array, error: Array, known: Sequence[int] = (), free_pose: bool = False
-) -> EquivalentErrors:
+def equivalent_errors(model: ReducedModel, mu: Array, error: Array, free_pose: bool = False) -> EquivalentErrors:
     """Parameters' changes that move the surface most nearly as an error of the displacement does, and what is left.
 
     Unknown loads among the parameters are as likely as their energy has it.
@@ -62,13 +67,11 @@ def equivalent_errors(
     model : whose sensitivities are taken.
     mu : (d,) the state, SI.
     error : (n, 3) true displacement minus the model's, at the nodes, metres.
-    known : numbers of the parameters that do not change.
     free_pose : whether the pose changes as well.
     """
     nodes, ranges = np.unique(model.triangles), np.array([p.upper - p.lower for p in model.parameters])
     value, slopes = model.fields["displacement"].value_and_sensitivities(mu)
     effects = slopes[:, nodes].reshape(len(ranges), -1).T * ranges
-    effects[:, list(known)] = 0.0
     rows, wanted = effects, error[nodes].ravel()
     if model.energy is not None:
         extent = float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
@@ -84,7 +87,8 @@ def equivalent_errors(
     in_object = error[nodes].ravel() - effects @ changes
     left = in_object - poses @ (poses.T @ in_object)
     found = np.asarray(ranges * changes, dtype=np.float64)
-    return EquivalentErrors(found, _rms(left.reshape(-1, 3)), _rms(in_object.reshape(-1, 3)))
+    products = np.asarray(rows.T @ rows / np.outer(ranges, ranges) / len(nodes), dtype=np.float64)
+    return EquivalentErrors(found, _rms(left.reshape(-1, 3)), _rms(in_object.reshape(-1, 3)), products)
 
 
 def _rigid_motions(positions: Array) -> Array:
@@ -109,13 +113,10 @@ def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, A
         "errors", by parameter, of each state, SI; "displacement_rms_mm" of the surface there; "left_rms_mm" of the
         displacement's error that no change of the parameters makes good. "with_free_pose" is the same where a rigid
         motion makes it good too, and "in_object_rms_mm" there what is left with that motion. Of a model that may have
-        unknown loads, "with_unknown_loads" is the same where these make it good too. Of a model of one time,
-        "at_known_time" is the same where the other parameters alone do: time may stand for a load almost as well in the
-        state that was solved again, and not at other times.
+        unknown loads, "with_unknown_loads" is the same where these make it good too. "products_m2" of each state are
+        those of `EquivalentErrors`, SI, which say what the others make good where something else tells some.
     """
     found = _entry(model, states)
-    if len(model.clocks) == 1 and len(model.parameters) > 1:
-        found[AT_KNOWN_TIME] = _entry(model, states, model.clocks)
     if model.unknown_loads is not None and model.energy is None:
         none = np.zeros(model.unknown_loads.count)
         found[WITH_LOADS] = _entry(
@@ -124,19 +125,26 @@ def parameter_errors(model: ReducedModel, states: Sequence[tuple[Array, Array, A
     return found
 
 
-def _entry(
-    model: ReducedModel, states: Sequence[tuple[Array, Array, Array]], known: Sequence[int] = ()
-) -> dict[str, Any]:
-    """By those parameters that are not ``known``."""
+def _entry(model: ReducedModel, states: Sequence[tuple[Array, Array, Array]]) -> dict[str, Any]:
     nodes, entries = np.unique(model.triangles), list[dict[str, Any]]()
     for free_pose in (False, True):
-        matched = [equivalent_errors(model, mu, finer - own, known, free_pose) for mu, own, finer in states]
+        matched = [equivalent_errors(model, mu, finer - own, free_pose) for mu, own, finer in states]
         found = np.array([one.changes for one in matched])
         errors = {parameter.name: found[:, k].tolist() for k, parameter in enumerate(model.parameters)}
         sizes, left = [1e3 * _rms(finer[nodes]) for _, _, finer in states], [1e3 * one.left for one in matched]
-        entries.append({ERRORS: errors, SIZES: sizes, LEFT: left})
+        products = [one.products.tolist() for one in matched]
+        entries.append({ERRORS: errors, SIZES: sizes, LEFT: left, PRODUCTS: products})
     entries[1][IN_OBJECT] = [1e3 * one.in_object for one in matched]
     return entries[0] | {WITH_FREE_POSE: entries[1]}
+
+
+def errors_alone(stated: Mapping[str, Any]) -> dict[str, Array]:
+    """Errors of each parameter at the states (k,), SI, where all others are known, of an entry of a certificate."""
+    changes, products = np.array(list(stated[ERRORS].values())).T, np.array(stated[PRODUCTS])
+    own = np.einsum("kdd->kd", products)
+    pushes = np.einsum("kde,ke->kd", products, changes)
+    alone = np.divide(pushes, own, out=np.zeros_like(pushes), where=own > 0.0)
+    return dict(zip(stated[ERRORS], alone.T, strict=True))
 
 
 def surface_modes(model: ReducedModel) -> Array:
@@ -161,26 +169,33 @@ class ParameterErrors:
 
     Attributes
     ----------
-    per_metre : (k, d) errors at the states solved again, SI, over the root mean square displacement there.
-    left_share : of that displacement, root mean square over the states: what no change of the parameters makes good.
-    object_share : the same in the object's frame, where what the pose makes good is an error too.
+    errors : (k, d) at the states solved again, SI.
+    sizes : (k,) root mean square displacement there, metres.
+    left : (k,) squared, square metres: what no change of the parameters makes good.
+    in_object : (k,) the same in the object's frame, where what the pose makes good is an error too.
+    effects : (k, d, d) mean products of what the parameters move the surface by, as of `EquivalentErrors`; zeros where
+        they are unknown.
+    ranges : (d,) of the parameters.
     functions : of the displacement.
     products : (m, m) mean products of its modes on the surface, squared metres.
     n_loads : unknown loads among the last parameters.
+    in_frame : the same of a pose that is known, where this is of a free one.
     """
 
-    per_metre: Array
-    left_share: float
-    object_share: float
+    errors: Array
+    sizes: Array
+    left: Array
+    in_object: Array
+    effects: Array
+    ranges: Array
     functions: Functions
     products: Array
     n_loads: int = 0
+    in_frame: ParameterErrors | None = None
 
     @classmethod
-    def of(
-        cls, model: ReducedModel, at_known_time: bool = False, free_pose: bool = False, products: Array | None = None
-    ) -> ParameterErrors | None:
-        """Those of a model, perhaps where its time is known or the pose free; None where its certificate has none.
+    def of(cls, model: ReducedModel, free_pose: bool = False, products: Array | None = None) -> ParameterErrors | None:
+        """Those of a model, perhaps where the pose is free; None where its certificate has none.
 
         ``products`` : as of another case of the same model; None to compute them.
         """
@@ -188,19 +203,51 @@ class ParameterErrors:
         if stated is None or not model.parameters:
             return None
         stated = stated.get(WITH_LOADS, stated) if model.n_loads else stated
-        stated = stated.get(AT_KNOWN_TIME, stated) if at_known_time else stated
+        in_frame = cls.of(model, False, products) if free_pose else None
         stated = stated.get(WITH_FREE_POSE, stated) if free_pose else stated
         sizes, none = 1e-3 * np.array(stated[SIZES]), [0.0] * len(stated[SIZES])
-        left = 1e-3 * np.array(stated.get(LEFT, none))
-        in_object = 1e-3 * np.array(stated.get(IN_OBJECT, stated.get(LEFT, none)))
+        left = (1e-3 * np.array(stated.get(LEFT, none))) ** 2
+        in_object = (1e-3 * np.array(stated.get(IN_OBJECT, stated.get(LEFT, none)))) ** 2
         errors = np.array([stated[ERRORS].get(p.name, none) for p in model.parameters]).T
         moved = sizes > 0.0
         if not moved.any():
             return None
-        products = mean_products(surface_modes(model)) if products is None else products
-        shares = [float(np.sqrt(np.mean((part[moved] / sizes[moved]) ** 2))) for part in (left, in_object)]
-        functions = model.displacement.functions
-        return cls(errors[moved] / sizes[moved, None], shares[0], shares[1], functions, products, model.n_loads)
+        if products is None:
+            products = mean_products(surface_modes(model)) if in_frame is None else in_frame.products
+        return cls(
+            errors[moved],
+            sizes[moved],
+            left[moved],
+            in_object[moved],
+            _effects(model, stated)[moved],
+            model.upper - model.lower,
+            model.displacement.functions,
+            products,
+            model.n_loads,
+            in_frame,
+        )
+
+    def holding(self, known: NDArray[np.int64], shares: Array | None = None) -> ParameterErrors:
+        """The same where something else tells some parameters, so that the others make the error good.
+
+        Parameters
+        ----------
+        known : (q,) numbers of the parameters.
+        shares : (q, q) of a change of them that this keeps from an estimate; None where it keeps all.
+        """
+        taken, others = np.zeros_like(self.errors), np.setdiff1d(np.arange(len(self.ranges)), known)
+        held = self.errors[:, known]
+        taken[:, known] = held if shares is None else held @ shares.T
+        scale = self.ranges[others]
+        for change, effects in zip(taken, self.effects, strict=True):
+            normal = effects[np.ix_(others, others)] * np.outer(scale, scale)
+            wanted = effects[np.ix_(others, known)] @ change[known] * scale
+            change[others] = -scale * np.linalg.lstsq(normal, wanted, rcond=LEAST_EFFECT**2)[0]
+        found = self.errors - taken
+        left = self.left + _squares(taken, self.effects)
+        of_frame = self if self.in_frame is None else self.in_frame
+        before, after = (_squares(of_frame.errors - part, of_frame.effects) for part in (self.errors, found))
+        return replace(self, errors=found, left=left, in_object=np.maximum(self.in_object + after - before, 0.0))
 
     def at(self, mu: Array) -> tuple[Array, float, float]:
         """Covariance (d, d) of the parameters at a state ``mu`` (d,), SI, and what is left of the displacement's error.
@@ -208,24 +255,51 @@ class ParameterErrors:
         The latter root mean square lengths, metres: as the camera sees it, and in the object's frame.
         """
         factors, size = self.factors(mu), float(np.sqrt(self._squared(mu)))
-        return factors @ factors.T, self.left_share * size, self.object_share * size
+        left, in_object = (np.sqrt(np.mean(part / self.sizes**2)) for part in (self.left, self.in_object))
+        return factors @ factors.T, float(left) * size, float(in_object) * size
 
     def factors(self, mu: Array) -> Array:
         """Errors (d, k) of the parameters at a state ``mu`` (d,), SI, alike in all states: their squares add up."""
-        return np.asarray(np.sqrt(self._squared(mu) / len(self.per_metre)) * self.per_metre.T)
+        size, own = float(np.sqrt(self._squared(mu))), len(mu) - self.n_loads
+        found = self.errors * (size / self.sizes)[:, None]
+        # By the same movement of the surface; one that hardly moves it is anywhere in its range, and no more.
+        rows = self._rows(mu)[1 : 1 + own]
+        moves = np.sqrt(np.maximum(np.einsum("dm,mn,dn->d", rows, self.products, rows), np.finfo(float).tiny))
+        of_frame = self if self.in_frame is None else self.in_frame
+        there = np.sqrt(np.einsum("kdd->kd", of_frame.effects)[:, :own])
+        limits = np.maximum(np.abs(found[:, :own]), self.ranges[:own])
+        moved = np.where(there > 0.0, found[:, :own] * there / moves, found[:, :own])
+        found[:, :own] = np.clip(moved, -limits, limits)
+        return np.asarray(found.T / np.sqrt(len(found)))
 
     def _squared(self, mu: Array) -> float:
         """Mean square displacement of the surface, squared metres.
 
         Where unknown loads push back what the study's own have moved, the body is strained by both.
         """
-        row = self._row(mu)
+        row = self._rows(mu)[0]
         parts = [row]
         if self.n_loads:
-            by_study = self._row(np.append(mu[: -self.n_loads], np.zeros(self.n_loads)))
+            by_study = self._rows(np.append(mu[: -self.n_loads], np.zeros(self.n_loads)))[0]
             parts = [by_study, row - by_study]
         return max(float(sum(row @ self.products @ row for row in parts)), 0.0)
 
-    def _row(self, mu: Array) -> Array:
-        """Values (m,) of the displacement's functions."""
-        return self.functions.rows(self.functions.nearest_inside(mu))[0]
+    def _rows(self, mu: Array) -> Array:
+        """Values of the displacement's functions and their derivatives (1 + d, m)."""
+        return self.functions.rows(self.functions.nearest_inside(mu))
+
+
+def _effects(model: ReducedModel, stated: Mapping[str, Any]) -> Array:
+    """Products (k, d, d) that a certificate states, by the model's parameters; zeros of those that it does not have."""
+    names = [p.name for p in model.parameters]
+    found = np.zeros((len(stated[SIZES]), len(names), len(names)))
+    if PRODUCTS in stated:
+        at = [names.index(name) for name in stated[ERRORS] if name in names]
+        own = [k for k, name in enumerate(stated[ERRORS]) if name in names]
+        found[np.ix_(range(len(found)), at, at)] = np.array(stated[PRODUCTS])[np.ix_(range(len(found)), own, own)]
+    return found
+
+
+def _squares(changes: Array, effects: Array) -> Array:
+    """Mean square movements (k,) of the surface by changes (k, d) of the parameters, squared metres."""
+    return np.asarray(np.einsum("kd,kde,ke->k", changes, effects, changes), dtype=np.float64)

@@ -194,15 +194,22 @@ def with_model_errors(
     estimate = result.estimate
     if errors is None or estimate is None:
         return result
-    mu = estimate.state.parameters
-    d, by_model = len(mu), errors.at(mu)
-    sought = np.diag(estimate.covariance)[:d] > 0.0
-    by_model = replace(by_model, parameters=np.outer(sought, sought) * by_model.parameters)
-    held = np.zeros((d + 6, d)) if held is None else held
-    made_good = np.eye(d + 6, d) - held
-    added, of_shape = (part @ by_model.parameters @ part.T for part in (made_good, held))
-    by_model, before = replace(by_model, parameters=added[:d, :d]), estimate.covariance
-    found = replace(estimate, covariance=before + added, by_model=by_model, of_shape=before + of_shape)
+    mu, covariance = estimate.state.parameters, estimate.covariance.copy()
+    d, made_good, of_shape = len(mu), np.eye(len(covariance), len(mu)), estimate.covariance
+    sought, by_model = np.diag(covariance)[:d] > 0.0, errors.at(mu)
+    seen = np.outer(sought, sought)
+    by_mesh, by_reduction = seen * by_model.by_mesh, seen * by_model.by_reduction
+    if held is not None:
+        of_shape = of_shape + held @ (by_mesh + by_reduction) @ held.T
+        # The mesh's error is that of other states, where the other unknowns make good what they do in these.
+        known = np.flatnonzero(held.any(axis=0))
+        by_mesh = seen * errors.holding(known, held[np.ix_(known, known)]).at(mu).by_mesh
+        made_good = made_good - held
+    of_reduction = made_good @ by_reduction @ made_good.T
+    by_model = replace(by_model, by_mesh=by_mesh, by_reduction=of_reduction[:d, :d])
+    covariance += of_reduction
+    covariance[:d, :d] += by_mesh
+    found = replace(estimate, covariance=covariance, by_model=by_model, of_shape=of_shape)
     return replace(result, estimate=found)
 
 

@@ -120,7 +120,7 @@ class SystematicErrors:
         n_factors = 0 if self._moved is None else self._moved.shape[2]
         self._by_reference = np.zeros((size, n_factors))
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
-        self._by_known = np.zeros((size, size))
+        self._by_known = self._kept_by_known = np.zeros((size, size))
         self._scale.forget_frames()
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
@@ -220,9 +220,11 @@ class SystematicErrors:
             covariance += by_blur @ by_blur.T
         by_scale = gain @ self._scale.push(self._points, estimate.state, past, depths)
         covariance += np.outer(by_scale, by_scale)
-        self._by_known = gain @ known  # of this frame, whether or not later ones rest on it
+        # Of this frame, whether or not later ones rest on it.
+        self._by_known = gain @ (known + past @ self._kept_by_known)
         if keeps:
             self._by_reference, self._by_model = by_reference, by_model
+            self._kept_by_known = self._by_known
             self._scale.keep(by_scale)
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
@@ -336,7 +338,7 @@ class SystematicErrors:
         of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
             what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        by_reference, by_known = self.reference_factor * self._by_reference, self._by_known
+        by_reference, by_known = self.reference_factor * self._by_reference, self._kept_by_known
         return partial(self._of_deformation, state, by_reference, by_known, of_model)
 
     def _of_deformation(
