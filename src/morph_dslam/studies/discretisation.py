@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -167,7 +168,8 @@ def _estimate(
         state, pivots = kept[index], int(kept[index]["pivots"])
         found = finer.solve(state["dofs"], state["mu"], in_time)
         _check_same_branch(finer.problem, found, pivots)
-        return _snapshot(finer.problem, found)
+        snapshot = _snapshot(finer.problem, found)
+        return replace(snapshot, outputs=snapshot.outputs | finer.reactions_in_balance(found))
 
     solved, left_out = _solved_again(chosen, solve_again, _budget(study, max(seconds, solving)))
     figures = _figures(model, snapshots, sweep.problem, finer.problem, solved)

@@ -15,6 +15,8 @@ from morph_dslam.mechanics.solvers.continuation import loaded_state
 from morph_dslam.mechanics.solvers.linear_solver import SolverMaker
 from morph_dslam.mechanics.solvers.newton import Equations, Linearisation, State, size, solve
 from morph_dslam.mechanics.solvers.two_level import LowerOrder, TwoLevelSolver
+from morph_dslam.model.reduced_model import REACTION
+from morph_dslam.studies.solid_sweep import response_reactions, support_reactions
 
 Array = NDArray[np.float64]
 #: Of the last correction: at first in units of the body's size, then as a part of what the finer elements changed.
@@ -37,6 +39,7 @@ class HigherOrder:
 
     def __init__(self, coarse: SolidProblem, problem: SolidProblem, iterative: bool = False) -> None:
         self._coarse, self.problem, self.iterative = coarse, problem, iterative
+        self._equations: _Stoppable | None = None
 
     def solve(self, dofs: Array, mu: Array, in_time: Callable[[], bool] = lambda: True) -> State:
         """The solution at ``mu`` (d,) next to one of the coarse solid, to a few percent of the difference.
@@ -59,6 +62,7 @@ class HigherOrder:
         make = partial(TwoLevelSolver, lower=self._lower_order(dofs, mu)) if self.iterative else None
         pressures = self.problem.embedded_pressures(self._coarse, dofs)
         equations, given = _Stoppable(self.problem, in_time, make), self._embedded(dofs)
+        self._equations = equations
         given[: len(pressures)] += pressures
         for is_held in (False, True) if pressures.any() else (True,):
             start = State(mu, given)
@@ -75,6 +79,20 @@ class HigherOrder:
             return loaded_state(equations, mu, start.dofs, PART * TOLERANCE)
         except SolverError:
             return self._from_rest(equations, dofs, mu)
+
+    def reactions_in_balance(self, found: State) -> dict[str, Array]:
+        """Force (3,) N and moment (3,) Nm about the origin on each set that is held, of the last solution.
+
+        What that lacks for balance, its last tangent moves on to the supports: a few percent of a difference of shapes
+        may be many of a force that statics alone determine, since cells are stiff.
+        """
+        outputs, mu = support_reactions(self.problem, found.dofs, found.mu), found.mu
+        tangent = None if self._equations is None else self._equations.latest
+        if tangent is None:
+            return outputs
+        rest = -tangent.solve(self.problem.residual(found.dofs, mu))
+        moved = response_reactions(self.problem, found.dofs, mu, rest[None], tangent.apply(rest)[None])
+        return {name: value + moved[REACTION + name][0, 0] for name, value in outputs.items()}
 
     def _from_rest(self, equations: Equations, dofs: Array, mu: Array) -> State:
         """The solution at ``mu`` (d,) that loads lead to which grow from rest, if they lead to ``dofs`` (n,) too.
@@ -125,11 +143,13 @@ class _Stoppable:
         self.prescribed, self.prescribed_slopes = problem.prescribed, problem.prescribed_slopes
         self.residual, self.residual_slopes = problem.residual, problem.residual_slopes
         self._solver = problem.solver_of(problem.free, make) if make else problem.solver
+        self.latest: Linearisation | None = None
 
     def linearise(self, x: Array, mu: Array) -> Linearisation:
         if not self._in_time():
             raise OutOfTime
-        return self._problem.linearise(x, mu, self._solver)
+        self.latest = self._problem.linearise(x, mu, self._solver)
+        return self.latest
 
 
 class _Added(_Stoppable):
