@@ -161,6 +161,21 @@ def test_a_series_is_found_from_ramps_and_relaxation():
     assert max(found.fit.errors) < 1e-5
 
 
+def test_terms_of_a_series_are_in_the_order_of_their_times():
+    """The ranges of the times are given the other way round."""
+    time = np.r_[np.linspace(0.0, 2.0, 25), 2.0 + np.geomspace(0.1, 60.0, 25)]
+    stress = ramp_and_hold(time, 2.0, 1.8, (0.4, 0.3), (0.8, 15.0))
+    test = MaterialTest("tension", np.minimum(1.0 + 0.8 * time / 2.0, 1.8), stress, time)
+    law = partial(MooneyRivlin, c01=0.0, bulk=1e9)
+    found = fit_law(law, {"c10": (1e4, 1e5)}, [test], ([(0.0, 0.99)] * 2, [(5.0, 50.0), (0.2, 4.0)]), starts=2)
+    assert found.material.prony.times == pytest.approx((0.8, 15.0), rel=1e-2)
+    assert found.material.prony.relative_moduli == pytest.approx((0.4, 0.3), rel=1e-2)
+    names = ["relative_modulus_1", "relative_modulus_2", "time_1", "time_2"]
+    assert [found.constants[name] for name in names] == pytest.approx([0.4, 0.3, 0.8, 15.0], rel=1e-2)
+    # The deviation of the long time is the larger one.
+    assert found.deviations["time_2"] > found.deviations["time_1"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["independent", "smooth"])
 def test_deviations_are_those_of_repeated_tests(kind):

@@ -145,7 +145,7 @@ def fit_law(
     moduli = _moduli(values, n_terms)
     names = [_MODULUS + name.removeprefix(_SHARE) if name in moduli else name for name in all_bounds]
     constants = dict(zip(names, (values | moduli).values(), strict=True))
-    return Fit(
+    found = Fit(
         material=assembled(law, values, n_terms),
         constants=constants,
         deviations=dict(zip(names, deviations.tolist(), strict=True)),
@@ -153,6 +153,29 @@ def fit_law(
         errors=errors,
         error=float(np.sqrt(np.mean(np.square(errors)))),
         computed=computed,
+    )
+    return found if n_terms == 0 else _in_order_of_time(found)
+
+
+def _in_order_of_time(fit: Fit) -> Fit:
+    """The same with the terms of its series from the shortest time to the longest: the ranges of times overlap."""
+    series = fit.material.prony
+    assert series is not None
+    order = sorted(range(len(series.times)), key=lambda term: fit.constants[f"{_TIME}{term + 1}"])
+
+    def sorted_terms(values: Mapping[str, float]) -> dict[str, float]:
+        terms = {
+            f"{kind}{place + 1}": values[f"{kind}{term + 1}"]
+            for kind in (_MODULUS, _TIME)
+            for place, term in enumerate(order)
+        }
+        return {name: terms.get(name, value) for name, value in values.items()}
+
+    moduli, times = (tuple(part[k] for k in order) for part in (series.relative_moduli, series.times))
+    # All terms are alike in that they leave the bulk elastic.
+    material = replace(fit.material, prony=replace(series, relative_moduli=moduli, times=times))
+    return replace(
+        fit, material=material, constants=sorted_terms(fit.constants), deviations=sorted_terms(fit.deviations)
     )
 
 
