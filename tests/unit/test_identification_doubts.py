@@ -79,6 +79,13 @@ def test_another_law_is_seen_from_neighbouring_residuals() -> None:
     assert "neighbouring residuals of force are alike" in lines(found)
 
 
+def test_errors_of_a_load_cell_that_last_are_named_beside_the_law() -> None:
+    """A drift that wanders over the curve, of a law that is right."""
+    drift = 3.0 * np.sin(np.linspace(0.0, 3.0 * np.pi, len(NOISE)))
+    table = forces(of_law(0.4) + drift)
+    assert "errors of the load cell last over many readings" in lines(identify(table.model, [table], ["b"]))
+
+
 def test_a_factor_of_all_moduli_that_no_unit_explains_is_doubted() -> None:
     table = forces(30.0 * of_law(0.0) + 3.0)
     figures = summarise(identify(table.model, [table], moduli=True))

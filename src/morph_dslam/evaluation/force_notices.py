@@ -158,7 +158,8 @@ class NeighboursAlike(ForceNotice):
 
     template: ClassVar[str] = (
         "neighbouring residuals of {name} are alike (Durbin-Watson {durbin_watson:.2g}; 2 if independent): the law, "
-        "the loading or the support differs from the model's, which no interval or deviation contains; see {picture}"
+        "the loading or the support differs from the model's, or errors of the load cell last over many readings; "
+        "intervals and deviations do not contain it in full; see {picture}"
     )
     durbin_watson: float
     picture: str
