@@ -175,11 +175,11 @@ def test_every_documented_action_is_one(server):
     page = (PROJECT / "docs" / "studio.md").read_text().partition("## By a script")[2].partition("## Who can")[0]
     rows = re.findall(r"^\| (`[a-z_`, ]+) \| (.*) \|$", page.partition("| action |")[2], re.MULTILINE)
     actions = {name: words for names, words in rows for name in re.findall(r"`(\w+)`", names)}
-    assert len(actions) == 22
+    assert len(actions) == 31
     known = Steps(server.project).actions
     arguments = {each for name in actions for each in inspect.signature(known[name]).parameters}
     named = {word for words in actions.values() for word in re.findall(r"`(\w+)`", words)}
-    assert named - {"notes", "pairs", "scan"} <= arguments
+    assert named - {"notes", "pairs", "scan", "run", "log", "frames"} <= arguments
     kinds = re.search(r"kinds are (.*) \|", page)[1]
     assert set(re.findall(r"`(\w+)`", kinds)) == set(UPLOADS)
 

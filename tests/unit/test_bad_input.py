@@ -25,7 +25,7 @@ from morph_dslam.evaluation.pixels import load_tracks
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.evaluation.run_report import write_run_report
 from morph_dslam.io.camera_files import load_camera
-from morph_dslam.io.folders import make_run_folder, only_writer
+from morph_dslam.io.folders import clear_run_folder, make_run_folder, only_writer
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.state_choice import read_path
 from morph_dslam.io.trajectory import load_trajectory
@@ -173,13 +173,11 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     make_run_folder(tmp_path / "a" / "run", overwrite=False)
     assert (tmp_path / "a" / "run").is_dir()
-    (tmp_path / "a" / "run" / "pixel_evaluation.json").write_text("{}")
     for sign in ("result.h5", "trajectory.txt"):
         (tmp_path / "a" / "run" / sign).write_text("")
         with pytest.raises(TrackingError, match="holds a run already"):
             make_run_folder(tmp_path / "a" / "run", False, sign)
         make_run_folder(tmp_path / "a" / "run", True, sign)
-    assert not (tmp_path / "a" / "run" / "pixel_evaluation.json").exists()  # of the run that was overwritten
     for name in ("file", "file/run"):
         with pytest.raises(TrackingError, match="cannot write the run to"):
             make_run_folder(tmp_path / name, overwrite=True)
@@ -207,7 +205,7 @@ def test_nothing_of_a_run_that_is_overwritten_stands_in_the_report_of_the_next(t
         (tmp_path / name).write_bytes(picture)
     for name in ("latency.csv", "augmented.mp4", "report.html", "notes.txt", "plots/own.txt"):
         (tmp_path / name).write_text("")
-    make_run_folder(tmp_path, overwrite=True)
+    clear_run_folder(tmp_path)
     assert "<img" not in write_run_report(tmp_path, run).read_text()
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert not left & {*of_the_run, "latency.csv", "augmented.mp4"}

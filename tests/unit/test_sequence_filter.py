@@ -188,7 +188,7 @@ def test_a_parameter_walks_on_while_the_object_is_lost():
     for n_blank, n_without in ((3, 0), (0, 20)):
         before, after = deviations(n_blank, n_without, (("twist", step),))
         predicted = before**2 + (n_blank + n_without + 1) * step**2
-        assert after == pytest.approx(np.sqrt(1.0 / (1.0 / own**2 + 1.0 / predicted)), rel=0.02)
+        assert after == pytest.approx(np.sqrt(1.0 / (1.0 / own**2 + 1.0 / predicted)), rel=0.03)
 
 
 def test_wrong_early_value_is_given_up():

@@ -37,7 +37,7 @@ _OF_ONE_RUN = (
 
 
 def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> None:
-    """Make a run folder and those above it; pictures and evaluations of a run that is to be overwritten are deleted.
+    """Make a run folder and those above it.
 
     Parameters
     ----------
@@ -52,7 +52,10 @@ def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> N
     """
     check_free(folder / sign, "a run", overwrite, TrackingError)
     _make(folder)
-    # They would stand in the report of the new run, or beside it as if they were of it.
+
+
+def clear_run_folder(folder: Path) -> None:
+    """Delete pictures and evaluations of the run that is overwritten: they would stand in the report of the new one."""
     for old in (path for pattern in _OF_ONE_RUN for path in folder.glob(pattern)):
         old.unlink()
 

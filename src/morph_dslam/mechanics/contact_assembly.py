@@ -243,6 +243,8 @@ class ContactAssembly:
 
     def _moves(self, contact: RigidObstacle) -> bool:
         """Whether an obstacle is elsewhere at other parameters; an amplitude alone, too, may move it."""
+        if any(slopes.any() for slopes in contact.slopes(self._symbols)):
+            return True
         places, present = self._mesh.nodes[self._mesh.set_nodes(contact.on)], self._symbols.present
         gaps = []
         for mu in (present, *self._symbols.telling_states()):

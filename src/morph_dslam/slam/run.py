@@ -13,7 +13,7 @@ from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
 from morph_dslam.io.colmap import ColmapModel, read_colmap_model
-from morph_dslam.io.folders import make_run_folder, only_writer
+from morph_dslam.io.folders import clear_run_folder, make_run_folder, only_writer
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.slam.camera_terms import CameraTerm, with_terms_of
@@ -153,6 +153,7 @@ def run_slam(
             summary: dict[str, Any] = {}
             if frames:
                 scene = replace(finish_scene(slam, frames, again), refined=tuple(refine))
+                clear_run_folder(output)
                 summary = write_run(output, scene, more, notes)
     return summary
 

@@ -20,7 +20,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import cross_matrix, rotation_log
 from morph_dslam.io.camera_files import save_camera
-from morph_dslam.io.folders import make_run_folder
+from morph_dslam.io.folders import clear_run_folder, make_run_folder
 from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.run_states import FORMAT, VERSION
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
@@ -75,6 +75,7 @@ class RunFolder:
         overwrite: bool = False,
     ) -> None:
         make_run_folder(path, overwrite)
+        clear_run_folder(path)
         self.path, self.name, self.results, self.overwrite = path, name, results, overwrite
         self._camera, self._inner, self._repeated = camera, inner, RepeatedPictures()
         self._centres = InnerCentres(inner)

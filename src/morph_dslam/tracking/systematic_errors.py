@@ -338,7 +338,7 @@ class SystematicErrors:
         of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
             what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        by_reference, by_known = self.reference_factor * self._by_reference, self._kept_by_known
+        by_reference, by_known = self.reference_factor * self._by_reference, self._by_known
         return partial(self._of_deformation, state, by_reference, by_known, of_model)
 
     def _of_deformation(
