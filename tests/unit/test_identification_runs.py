@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
+from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.force import reaction_in_direction
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
@@ -15,6 +16,9 @@ from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.report import identification_lines, summarise
 from morph_dslam.identification.values import FACTOR
+from morph_dslam.model import SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.unknown_loads import UnknownLoads, with_unknown_loads
 from tests.support.edge_plate import plate_of_load
 
 LOADS = np.linspace(0.1, 0.9, 17)
@@ -77,6 +81,28 @@ def test_forces_by_a_known_load_do_not_have_the_errors_of_a_run() -> None:
     alone = MeasuredForces(run.model, curve, reaction_in_direction(run.model, "edge:x"))
     intervals = [identify(run.model, [t], moduli=True)[FACTOR].interval for t in (alone, replace(alone, run=run))]
     assert intervals[0] == intervals[1]
+
+
+def test_a_run_with_unknown_loads_is_refused_by_the_name_of_the_option() -> None:
+    plate, constant = (
+        plate_of_load(),
+        ParameterFunctions(np.zeros(2), np.ones(2), np.zeros((1, 2), int), np.ones((1, 1))),
+    )
+    responses = {
+        "displacement": SeparatedField(np.ones((1, 4, 3)), constant),
+        "reaction_force_edge": SeparatedField(np.zeros((1, 1, 3)), constant),
+        "compliance_root": SeparatedField(np.ones((1, 1, 1)), constant),
+    }
+    loads = UnknownLoads("", False, np.arange(4), np.ones((4, 3, 1)), np.ones((1, 6)), responses)
+    run, forces = run_of(LOADS, np.zeros(17)), 100.0 * 0.5 * LOADS
+    assert by_frame(run, forces).left_out == 0
+    loaded = with_unknown_loads(replace(plate, unknown_loads=loads))
+    loaded = replace(run, model=loaded, parameters=np.column_stack([run.parameters, np.full(17, 0.1)]))
+    with pytest.raises(IdentificationError, match="tracked with --unknown-loads"):
+        MeasuredForces(plate, by_frame(run, forces).curve, by_frame(run, forces).reaction, loaded)
+    # Forces by a known load do not need what the run has of its loads.
+    known = ForceCurve("load", LOADS, forces)
+    assert MeasuredForces(plate, known, by_frame(run, forces).reaction, loaded).left_out == 0
 
 
 @pytest.mark.slow

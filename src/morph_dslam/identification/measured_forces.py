@@ -43,6 +43,12 @@ class MeasuredForces:
     run : whose frames the curve is given by, and whose estimates are the parameters that are not identified; None for a
         curve over a parameter.
     free_zero : whether the zero of the load cell is an unknown offset.
+
+    Raises
+    ------
+    IdentificationError
+        If forces by frame have no run, or one with unknown loads that the model does not have; if too few forces are
+        left to compare, or several in one place contradict each other.
     """
 
     model: ReducedModel
@@ -56,6 +62,11 @@ class MeasuredForces:
     def __post_init__(self) -> None:
         if self.curve.against == "frame" and self.run is None:
             raise IdentificationError("forces by frame need the run that tracked these frames: give --run")
+        if self.run is not None and self.are_shown and self.run.model.energy is not None and self.model.energy is None:
+            raise IdentificationError(
+                "the run was tracked with --unknown-loads, and forces by frame are compared without such loads: track "
+                "again without --unknown-loads"
+            )
         if len(self.values) < FEWEST_FORCES:
             raise IdentificationError(
                 f"{len(self.values)} forces of {self.name} are left to compare, and {FEWEST_FORCES} are needed: "
