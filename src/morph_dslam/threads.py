@@ -49,7 +49,7 @@ def usable_cores() -> int:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
-        work, period = _QUOTA.read_text().split()
+        work, period = _QUOTA.read_text(encoding="utf-8").split()
     except (OSError, ValueError):
         return cores
     return cores if work == "max" else max(1, min(cores, round(int(work) / int(period))))

@@ -157,7 +157,7 @@ def _tracked_block(folder: Path) -> tuple[list[float], list[float]]:
     grey = np.random.default_rng(0).integers(0, 256, (256, 256), dtype=np.uint8)
     cv2.imwrite(str(folder / "print.png"), cv2.GaussianBlur(grey, (0, 0), 2.0, dst=None))
     md.build(md.make_study(STUDY), folder / "block.morph")
-    (folder / "scene.toml").write_text(SCENE)
+    (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
     sequence: Any = md.SimulatedSequence(folder / "scene.toml")
     tracker = md.Tracker(
         sequence.model, sequence.camera, md.register_landmarks(sequence.model, sequence.camera, sequence.landmarks)

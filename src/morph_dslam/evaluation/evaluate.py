@@ -65,7 +65,7 @@ def evaluate(run: str | Path | Run, truth: str | Path | PointTruth, bind_frame: 
         from morph_dslam.evaluation.run_report import plot_error_map, plot_errors_by_frame, write_run_report
 
         with writing(EvaluationError, folder):
-            (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            (folder / "evaluation.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
             plot_errors_by_frame(folder / "evaluation.png", error)
             plot_error_map(folder / "error_map.png", error, tracked.model)
             write_run_report(folder, tracked)
@@ -110,7 +110,7 @@ def evaluate_depth(
         from morph_dslam.evaluation.run_report import plot_depth_error_map, plot_depth_errors_by_frame
 
         with writing(EvaluationError, folder):
-            (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            (folder / "depth_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
             plot_depth_errors_by_frame(folder / "depth_evaluation.png", error)
             plot_depth_error_map(folder / "depth_error_map.png", error, tracked.model)
     return figures
@@ -157,7 +157,7 @@ def evaluate_pixels(
         from morph_dslam.evaluation.run_report import plot_pixel_error_map, plot_pixel_errors_by_frame, write_run_report
 
         with writing(EvaluationError, folder):
-            (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            (folder / "pixel_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
             plot_pixel_errors_by_frame(folder / "pixel_evaluation.png", error)
             plot_pixel_error_map(folder / "pixel_error_map.png", error, tracked.model)
             write_run_report(folder, tracked)
@@ -200,7 +200,7 @@ def evaluate_force(
         from morph_dslam.evaluation.run_report import plot_force, write_run_report
 
         with writing(EvaluationError, folder):
-            (folder / "force_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n")
+            (folder / "force_evaluation.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
             plot_force(folder / "force_evaluation.png", error)
             write_run_report(folder, tracked)
     return figures

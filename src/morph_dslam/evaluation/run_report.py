@@ -317,7 +317,7 @@ def _content(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise EvaluationError(f"{path} is damaged ({error}): restore or delete it") from error
     if not isinstance(content, dict):

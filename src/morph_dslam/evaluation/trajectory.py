@@ -266,7 +266,7 @@ def evaluate_trajectory(run: str | Path | Trajectory, truth: str | Path | Trajec
     if path is not None:
         with writing(EvaluationError, path.parent):
             content, picture = trajectory_evaluation_files(path)
-            content.write_text(json.dumps(figures, indent=2) + "\n")
+            content.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
             shown, alignment = ("se3", "SE(3)") if still else ("sim3", "Sim(3)")
             absolute, relative = errors[shown]
             plot_trajectory(picture, estimate, expected, absolute, relative, alignment)

@@ -37,7 +37,7 @@ def values_of_run(
         each other in one.
     """
     folder = Path(folder)
-    found = json.loads((folder / "summary.json").read_text())["one_over_the_sequence"]
+    found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["one_over_the_sequence"]
     of_model = {parameter.name: parameter for parameter in run.model.parameters}
     apart = [each["name"] for each in found if each["name"] in names and not each.get("is_one_value", True)]
     if apart and not measured:

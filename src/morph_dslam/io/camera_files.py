@@ -165,7 +165,7 @@ def save_camera(path: str | Path, camera: Camera) -> None:
         content["lens"] = camera.lens_model
     if camera.readout_s:
         content["readout_s"] = camera.readout_s
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
 def save_rig(path: Path, cameras: Sequence[tuple[Camera, RigidTransform]]) -> None:
@@ -183,7 +183,7 @@ def save_rig(path: Path, cameras: Sequence[tuple[Camera, RigidTransform]]) -> No
         if number:
             entry["T_cn_cnm1"] = (pose @ before.inverse).matrix.tolist()
         chain[f"cam{number}"], before = entry, pose
-    path.write_text(yaml.safe_dump(chain, sort_keys=False))
+    path.write_text(yaml.safe_dump(chain, sort_keys=False), encoding="utf-8")
 
 
 def _read_yaml(path: Path) -> object:

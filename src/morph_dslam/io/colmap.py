@@ -109,7 +109,7 @@ def write_colmap_model(folder: Path, camera: Camera, images: Sequence[ColmapImag
     folder.mkdir(parents=True, exist_ok=True)
     fx, fy, cx, cy = camera.intrinsics
     parameters = f"{fx:.6f} {fy:.6f} {cx + PIXEL_CENTRE:.6f} {cy + PIXEL_CENTRE:.6f}"
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {camera.width} {camera.height} {parameters}\n")
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {camera.width} {camera.height} {parameters}\n", encoding="utf-8")
     lines, tracks, errors = [], [[] for _ in points], [[] for _ in points]
     for number, image in enumerate(images, start=1):
         pose = image.camera_from_world
@@ -123,13 +123,13 @@ def write_colmap_model(folder: Path, camera: Camera, images: Sequence[ColmapImag
         for row, (point, miss) in enumerate(zip(image.point_ids.tolist(), misses.tolist(), strict=True)):
             tracks[point].append(f"{number} {row}")
             errors[point].append(miss)
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = [
         f"{row + 1} {x:.9f} {y:.9f} {z:.9f} 128 128 128 {np.mean(errors[row]):.4f} {' '.join(tracks[row])}"
         for row, (x, y, z) in enumerate(points)
         if tracks[row]
     ]
-    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 
 def _content(path: Path) -> list[str]:
     """The lines of a file that are no comments; those without observations are empty."""
-    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
 
 
 def _read_image(head: str, body: str, numbers: dict[int, int]) -> ColmapImage:

@@ -42,7 +42,7 @@ def write_table(path: Path, states: States, places: Sequence[dict[str, str | int
     so that a study can be made from an export.
     """
     parameters = states.model.parameters
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*places[0], *states.origins[0], *(f"{p.name} [{p.unit}]" for p in parameters)])
         for place, origin, mu in zip(places, states.origins, states.parameters, strict=False):
@@ -156,7 +156,7 @@ def _beginning(path: Path, length: int = -1) -> str:
     """The first characters of a file, or all; nothing if there is no such file."""
     if not path.is_file():
         return ""
-    with path.open(errors="replace") as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         return file.read(length)
 
 

@@ -120,4 +120,4 @@ def save_landmarks(path: str | Path, landmarks: Landmarks) -> None:
     if landmarks.frames is not None:
         header = f"{FRAME},{header}"
         lines = [f"{frame},{line}" for frame, line in zip(landmarks.frames, lines, strict=True)]
-    path.write_text("\n".join([header, *lines]) + "\n")
+    path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")

@@ -114,7 +114,7 @@ def save_trajectory(path: Path, trajectory: Trajectory) -> None:
     for timestamp, position, rotation in rows:
         quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True)
         lines.append(" ".join([f"{timestamp:.6f}", *(f"{x:.9g}" for x in (*position, *quaternion))]))
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _make(path: Path, rows: Iterator[tuple[float, Array]], is_numbered: bool = False) -> Trajectory:
@@ -190,7 +190,7 @@ def _colmap_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
 def _seven_scenes_rows(folder: Path) -> Iterator[tuple[float, Array]]:
     for path in sorted(folder.glob("frame-*.pose.txt")):
         number = int(re.findall(r"\d+", path.name)[-1])
-        values = _numbers(path.read_text().split(), str(path))
+        values = _numbers(path.read_text(encoding="utf-8").split(), str(path))
         if len(values) != 16:
             raise TrajectoryError(f"{path} has {len(values)} numbers: a pose has 4 x 4")
         yield number / SEVEN_SCENES_FPS, _rigid(values.reshape(4, 4)[:3], str(path))

@@ -45,7 +45,7 @@ def save_mesh(path: str | Path, mesh: Mesh, unit: str) -> None:
         lines += [f"*ELSET, ELSET={name}", *_wrapped((chosen + 1).tolist(), separate=True)]
     for name, faces in mesh.surfaces.items():
         lines += [f"*SURFACE, NAME={name}, TYPE=ELEMENT", *(f"{cell + 1}, S{face + 1}" for cell, face in faces)]
-    Path(path).write_text("\n".join(lines) + "\n")
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _wrapped(labels: list[int], separate: bool = False) -> list[str]:

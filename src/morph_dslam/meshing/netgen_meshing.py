@@ -81,7 +81,7 @@ def _read_obj(path: Path) -> tuple[Array, Indices]:
     """Vertices and faces alone; meshio refuses files whose texture coordinates outnumber the vertices."""
     points: list[list[float]] = []
     triangles: list[tuple[int, int, int]] = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         kind, *rest = line.split() or [""]
         try:
             if kind == "v":
@@ -184,7 +184,7 @@ def _quiet() -> Iterator[None]:
     sys.stdout.flush()
     sys.stderr.flush()
     saved = [os.dup(1), os.dup(2)]
-    with open(os.devnull, "w") as sink:
+    with open(os.devnull, "w", encoding="utf-8") as sink:
         for stream in (1, 2):
             os.dup2(sink.fileno(), stream)
         try:

@@ -339,7 +339,7 @@ class Registration:
         files = {key: None if file is None else os.path.relpath(file, path.parent) for key, file in named.items()}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(self.content() | files, indent=2) + "\n")
+            path.write_text(json.dumps(self.content() | files, indent=2) + "\n", encoding="utf-8")
         except OSError as error:
             raise RegistrationError(f"cannot write the registration to {path}: {error.strerror}") from error
 
@@ -443,7 +443,7 @@ def in_scene(registration: Registration, scene: Scene) -> Registration:
 def read_content(path: Path) -> dict[str, Any]:
     """The content of a file of `Registration.save`; raises RegistrationError if it cannot be read."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise RegistrationError(f"cannot read the registration {path}: {error.strerror}") from error
     except ValueError as error:

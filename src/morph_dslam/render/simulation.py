@@ -299,7 +299,7 @@ def _write_lists(output: Path, world: _World) -> None:
         return
     for name, folder, suffix in (("rgb", "frames", world.scene.image_format), ("depth", "depth", "png")):
         lines = [f"{time:.6f} {folder}/{frame:06}.{suffix}" for frame, time in enumerate(times)]
-        (output / f"{name}.txt").write_text("\n".join(lines) + "\n")
+        (output / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 class SimulatedSequence:

@@ -42,7 +42,7 @@ def write_run(folder: Path, scene: Scene, more: dict[str, Any], notes: Sequence[
     _plot_frames(plots / "frames.png", scene.frames)
     summary = scene.summary() | more
     summary["flags"] = [*notes, *summary["flags"]]
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n", encoding="utf-8")
     return summary
 
 
@@ -65,7 +65,7 @@ def _write_csv(path: Path, scene: Scene) -> None:
     poses = dict(zip(scene.trajectory.indices.tolist(), scene.trajectory.world_from_camera, strict=True))
     # In a map that follows what moves, residuals of a frame do not tell how far its pose is off.
     unknown = any(isinstance(notice, SceneNotRigid) for notice in scene.notices)
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         for frame in scene.frames:

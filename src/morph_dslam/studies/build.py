@@ -294,7 +294,7 @@ def _read(study: str | Path | Study) -> tuple[Study, str]:
     if not isinstance(study, str | Path):
         return study, study.model_dump_json()
     path = study_file(study)
-    return load_study(path), path.read_text()
+    return load_study(path), path.read_text(encoding="utf-8")
 
 
 def _check_held_out(study: Study, snapshots: Snapshots, output: Path) -> None:

@@ -52,7 +52,7 @@ class MaterialSection(Section):
         """Text of the file of a user's own law; empty for others."""
         function = self.constants.get("function")
         path = Path(function.rpartition(":")[0]) if isinstance(function, str) else None
-        return path.read_text() if path is not None and path.is_file() else ""
+        return path.read_text(encoding="utf-8") if path is not None and path.is_file() else ""
 
     def make(self, read: Reader) -> Material:
         """The material, its constants read as numbers or expressions."""

@@ -108,7 +108,7 @@ class _FailedAttempts:
     def reason(self, origin: int, sample: int) -> str | None:
         """Why ``sample`` could not be solved from ``origin`` (-1 for the root); None if never tried."""
         file = self._file(origin, sample)
-        return file.read_text(errors="replace") if file.is_file() else None
+        return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else None
 
     def record(self, origin: int, sample: int, reason: str) -> None:
         """Keep the reason of an attempt that failed."""
@@ -163,7 +163,7 @@ def run_sweep(study: ParametricStudy, samples: Array, folder: str | Path, execut
 def _alone(folder: Path) -> Iterator[None]:
     """No other sweep writes to this folder; what one that was killed left unfinished is removed."""
     with writing(StudyError):
-        opened = (folder / ".lock").open("w")
+        opened = (folder / ".lock").open("w", encoding="utf-8")
     with opened as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

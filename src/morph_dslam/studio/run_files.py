@@ -131,7 +131,7 @@ def run_of(run: Path, live: str) -> str | None:
     live : name of the folder of live frames.
     """
     try:
-        frames = json.loads((run / "summary.json").read_text())["inputs"]["frames"]
+        frames = json.loads((run / "summary.json").read_text(encoding="utf-8"))["inputs"]["frames"]
         name = Path(frames).name
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return None
@@ -143,7 +143,7 @@ def run_summary(run: Path) -> dict[str, Any] | None:
     path = run / "summary.json"
     if not path.is_file():
         return None
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict):
         raise StudioError("run/summary.json holds no summary: track again")
     return content

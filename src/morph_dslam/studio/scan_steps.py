@@ -133,7 +133,7 @@ class ScanSteps:
         model, camera = self._model_and_camera()
         try:
             keyframes = await self._worker.call(places.map_keyframes, self._project.path(_MAP), camera)
-            found["map"] = json.loads(summary.read_text()) | {"keyframes": keyframes}
+            found["map"] = json.loads(summary.read_text(encoding="utf-8")) | {"keyframes": keyframes}
             if self._project.has(_PLACE):
                 place = await self._worker.call(places.place_facts, model, self._project.path(_PLACE))
                 accepted = self._project.choices.get("place") if self.is_accepted else None

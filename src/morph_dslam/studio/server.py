@@ -78,7 +78,7 @@ class StudioServer:
         self._server = _Server(config, steps)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else _in_address(host)
         self.address = f"http://{shown}:{self.port}/?token={self.token}"
-        (project.folder / _OPEN_AT).write_text(self.address.partition("?")[0] + "\n")
+        (project.folder / _OPEN_AT).write_text(self.address.partition("?")[0] + "\n", encoding="utf-8")
 
     @property
     def phone_address(self) -> str | None:
@@ -140,7 +140,9 @@ def _keep_others_out(opened: ExitStack, project: Project) -> None:
         opened.enter_context(only_writer(project.folder))
     except TrackingError as error:
         try:
-            found = re.fullmatch(r"http://[\w.:\[\]-]+/", (project.folder / _OPEN_AT).read_text().strip())
+            found = re.fullmatch(
+                r"http://[\w.:\[\]-]+/", (project.folder / _OPEN_AT).read_text(encoding="utf-8").strip()
+            )
         except (OSError, ValueError):
             found = None
         where = f" at {found[0]}" if found else ""

@@ -178,7 +178,7 @@ class Steps:
                 await self._worker.call(clicks.take_camera, path, project.path(names.CAMERA))
             project.choose(camera_from=name, camera_note=None)
         elif kind == "landmarks":
-            project.write(names.LANDMARKS, path.read_text()) if path.name != names.LANDMARKS else None
+            project.write(names.LANDMARKS, path.read_text(encoding="utf-8")) if path.name != names.LANDMARKS else None
             # Nobody has said of these landmarks that they show the object undeformed.
             project.choose(pairs_were_of=None, at_rest=None)
         elif kind == "scan":

@@ -87,13 +87,13 @@ class FrameLog:
     def start_again(self) -> None:
         """Empty the file, for another pass over the frames."""
         with writing(TrackingError, self._path):
-            self._path.write_text("")
+            self._path.write_text("", encoding="utf-8")
 
     def __call__(self, tracked: TrackedFrame) -> None:
         """Write the frame that the run folders have just taken in; of several objects each line has the name."""
         several = len(self._folders) > 1
         lines = [({"object": name} if several else {}) | _line(run.results) for name, run in self._folders.items()]
-        with writing(TrackingError, self._path), self._path.open("a") as file:
+        with writing(TrackingError, self._path), self._path.open("a", encoding="utf-8") as file:
             file.write("".join(json.dumps(line) + "\n" for line in lines))
 
 

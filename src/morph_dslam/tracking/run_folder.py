@@ -116,7 +116,7 @@ class RunFolder:
         write_hdf5(path / "result.h5", run, self._centres)
         save_model(path / "model.morph", run.model.without_loads)
         summary = summarise(run, notices) | facts | {"versions": _versions()}
-        (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n")
+        (path / "summary.json").write_text(json.dumps(summary, indent=2, default=str) + "\n", encoding="utf-8")
         from morph_dslam.tracking.run_plots import write_plots  # matplotlib takes long to load
 
         write_plots(path / "plots", run)
@@ -246,7 +246,7 @@ def write_csv(path: Path, run: RunResults) -> None:
     largests = 1e3 * run.largest_displacements()
     more = [[*forces, *displacements] for forces, displacements in zip(reactions, points, strict=True)]
     rows = zip(run.frames, run.timestamps, run.results, run.at_bound(), largests, more, strict=True)
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header + of_reactions + of_points)
         for frame, timestamp, result, at_bound, largest, last in rows:

@@ -93,7 +93,7 @@ class LiveTimes:
 
     def write(self, path: Path) -> None:
         """Write when each frame was captured, and its latency, as a table."""
-        with path.open("w", newline="") as file:
+        with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["frame", "captured_s", "latency_ms"])
             for frame, captured, latency in zip(self.frames, self.captured, self.latency, strict=True):
