@@ -86,6 +86,26 @@ def test_a_folder_of_images_is_read_in_its_unit(folder, tmp_path):
     assert error.compared.max() <= 0.125e-3 + 1e-6  # half of the sensor's step
 
 
+def test_depth_of_a_recording_is_read_in_its_layout_s_unit_or_the_given_one(tmp_path):
+    for name, image in (("rgb", np.zeros((4, 4, 3), np.uint8)), ("depth", np.full((4, 4), 1500, np.uint16))):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), image)
+        (tmp_path / f"{name}.txt").write_text(f"0.0 {name}/0.png\n")
+    for given, metres in ((None, 0.3), (1000.0, 1.5)):
+        ((number, depth),) = read_depths(tmp_path, [0], given)
+        assert (number, float(depth.min()), float(depth.max())) == (0, pytest.approx(metres), pytest.approx(metres))
+    with pytest.raises(EvaluationError, match="cannot have 0 values a metre"):
+        list(read_depths(tmp_path, [0], 0.0))
+
+
+def test_depth_that_is_not_registered_to_the_colour_is_refused(tmp_path):
+    for number in (0, 1):
+        cv2.imwrite(str(tmp_path / f"frame-{number:06d}.color.png"), np.zeros((4, 4, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "frame-000001.depth.png"), np.full((4, 4), 1000, np.uint16))
+    with pytest.raises(EvaluationError, match="not registered to the colour camera"):
+        list(read_depths(tmp_path, [0, 1]))
+
+
 @pytest.mark.parametrize("n_frames", [3, 40])
 def test_a_frame_whose_depth_is_all_of_something_else_is_counted_and_not_drawn(tmp_path, n_frames):
     distances = [np.array([]), *(np.full(5, 1e-3 * k) for k in range(1, n_frames))]

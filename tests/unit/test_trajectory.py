@@ -66,6 +66,12 @@ def test_seven_scenes_poses_are_made_orthonormal(tmp_path):
     np.testing.assert_allclose(trajectory.world_from_camera[0, :3, :3], QUARTER, atol=1e-12)
 
 
+def test_a_seven_scenes_pose_that_is_no_text_is_named(tmp_path):
+    (tmp_path / "frame-000030.pose.txt").write_bytes("1 0 0 0 größe".encode("latin-1"))
+    with pytest.raises(TrajectoryError, match=r"frame-000030\.pose\.txt is not a text file"):
+        load_trajectory(tmp_path)
+
+
 def rigid(vector, shift):
     """A pose (4, 4) by its rotation vector, degrees, and its place."""
     matrix = np.eye(4)

@@ -29,7 +29,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--base-frame", type=int, metavar="N", help="with --depth: a frame in which nothing is deformed"
     )
     command.add_argument(
-        "--depth-per-metre", type=float, metavar="VALUES", help="with a folder of depth images: values a metre"
+        "--depth-per-metre", type=float, metavar="VALUES", help="with --depth: values a metre of the images"
     )
     command.add_argument(
         "--bind-frame",

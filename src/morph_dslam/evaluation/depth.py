@@ -19,7 +19,7 @@ from morph_dslam.evaluation.points import millimetres
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import open_source
-from morph_dslam.sources.frames import DepthScale, read_depth
+from morph_dslam.sources.frames import DepthScale, has_registered_depth, read_depth
 from morph_dslam.sources.recorded import numbered_images
 from morph_dslam.surface_distances import distances_to_surface
 
@@ -36,9 +36,15 @@ def read_depths(
 
     Parameters
     ----------
-    path : a ``depth.h5`` of `morph simulate`; a folder of numbered 16-bit images; or a recording with depth
-        of its own, in the layout of TUM RGB-D or 7-Scenes.
-    values_per_metre : of the images of a folder, which is taken for a recording without it.
+    path : a ``depth.h5`` of `morph simulate`; a folder of numbered 16-bit images; or a recording whose depth belongs
+        to its colour pixels, as in the layout of TUM RGB-D.
+    values_per_metre : of the depth images; a recording has its layout's without it, and a folder of numbered images
+        needs it.
+
+    Raises
+    ------
+    EvaluationError
+        While iterating, if the path holds no such depth, or an image cannot be read.
     """
     wanted = sorted(frames)
     try:
@@ -51,10 +57,10 @@ def read_depths(
             yield from _from_file(path, wanted)
         elif not path.is_dir():
             raise EvaluationError(f"there are no depth images at {path}")
-        elif values_per_metre is not None:
+        elif values_per_metre is not None and not has_registered_depth(open_source(path)):
             yield from _from_folder(path, wanted, values_per_metre)
         else:
-            yield from _from_recording(path, wanted)
+            yield from _from_recording(path, wanted, values_per_metre)
     except SourceError as error:
         raise EvaluationError(f"the depth images cannot be read: {error}") from error
 
@@ -84,11 +90,16 @@ def _from_folder(folder: Path, frames: Sequence[int], scale: float) -> Iterator[
             yield frame, read_depth(images[frame], f"frame {frame}", DepthScale(scale))
 
 
-def _from_recording(path: Path, frames: Sequence[int]) -> Iterator[tuple[int, DepthImage]]:
-    has_depth = False
-    for frame in open_source(path):
+def _from_recording(path: Path, frames: Sequence[int], scale: float | None) -> Iterator[tuple[int, DepthImage]]:
+    has_depth, source = False, open_source(path, depth_per_metre=scale)
+    for frame in source:
         if frame.depth is not None:
             has_depth = True
+            if not has_registered_depth(source):
+                raise EvaluationError(
+                    f"the depth images of {path} are not registered to the colour camera, so that their pixels show "
+                    "other points: register them first (docs/sources.md)"
+                )
             if frame.index in frames:
                 yield frame.index, frame.depth
     if not has_depth:

@@ -190,7 +190,7 @@ def _colmap_rows(path: Path, lines: list[str]) -> Iterator[tuple[float, Array]]:
 def _seven_scenes_rows(folder: Path) -> Iterator[tuple[float, Array]]:
     for path in sorted(folder.glob("frame-*.pose.txt")):
         number = int(re.findall(r"\d+", path.name)[-1])
-        values = _numbers(path.read_text(encoding="utf-8").split(), str(path))
+        values = _numbers(read_text(path, "pose", TrajectoryError).split(), str(path))
         if len(values) != 16:
             raise TrajectoryError(f"{path} has {len(values)} numbers: a pose has 4 x 4")
         yield number / SEVEN_SCENES_FPS, _rigid(values.reshape(4, 4)[:3], str(path))
