@@ -150,6 +150,22 @@ def test_frames_that_do_not_arrive_are_told_at_the_end(tmp_path, monkeypatch):
         streams.close()
 
 
+def test_an_earlier_recording_is_replaced_only_where_that_is_allowed(tmp_path, refused):
+    path, earlier = tmp_path / "run.rrd", b"an earlier recording" * 50
+    path.write_bytes(earlier)
+    with pytest.raises(StreamError, match="holds an earlier recording"):
+        StreamSink([f"rerun:{path}"])
+    message = refused(
+        "track", tmp_path, "--model", "a", "--camera", "b", "--landmarks", "c", "-o", tmp_path / "run",
+        "--stream", f"rerun:{path}",
+    )  # fmt: skip
+    assert "--overwrite" in message
+    assert path.read_bytes() == earlier
+    with StreamSink([f"rerun:{path}"], overwrite=True) as streams:
+        streams.begin({"run": StreamedObject(held_block_model(), "block")}, CAMERA)
+    assert any(entity.startswith("/world/objects/block") for entity, _ in columns(path))
+
+
 def test_places_that_are_none(tmp_path, refused):
     for where in (tmp_path / "run.txt", tmp_path / "missing" / "run.rrd", ""):
         with pytest.raises(StreamError):

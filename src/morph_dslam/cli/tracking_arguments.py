@@ -179,7 +179,11 @@ def _add_forces(group: _Group) -> None:
 
 def _add_output(group: _Group, required: bool) -> None:
     add_output(group, "RUN", "run folder to write", required)
-    add_flag(group, "--overwrite", "replace a run that is in the run folder, and the frame log of an earlier run")
+    add_flag(
+        group,
+        "--overwrite",
+        "replace a run that is in the run folder, and an earlier frame log or recording of a stream",
+    )
     add_repeated(
         group,
         "--point",

@@ -63,6 +63,11 @@ def _open_rerun(where: str) -> Publisher:
     return RerunPublisher(_recording(where))
 
 
+def _recorded_file(where: str) -> Path | None:
+    """The file that a stream to rerun writes, if it is none to a viewer."""
+    return Path(where) if where and not where.startswith("rerun+http") else None
+
+
 @dataclass(frozen=True)
 class _Kind:
     """A kind of stream.
@@ -73,44 +78,48 @@ class _Kind:
     mend : what to do where the module is missing.
     check : raises StreamError for a place that makes no sense.
     open : begins the stream.
+    file : the file that a stream to a place writes; None where it writes none.
     """
 
     module: str
     mend: str
     check: Callable[[str], object]
     open: Callable[[str], Publisher]
+    file: Callable[[str], Path | None] = lambda where: None
 
 
 _ROS_MISSING = "install ROS 2, `source /opt/ros/DISTRIBUTION/setup.bash`, and start `morph` there"
 _KINDS: dict[str, _Kind] = {
     "ws": _Kind("websockets", how_to_install("stream"), _address, _open_websocket),
-    "rerun": _Kind("rerun", how_to_install("rerun"), _recording, _open_rerun),
+    "rerun": _Kind("rerun", how_to_install("rerun"), _recording, _open_rerun, _recorded_file),
     "ros2": _Kind("rclpy", _ROS_MISSING, _prefix, _open_ros2),
 }
 
 
-def check_destination(text: str) -> None:
-    """Raise StreamError unless ``text`` is a destination that can be opened on this computer."""
-    _kind_and_place(text)
+def check_destination(text: str, overwrite: bool = False) -> None:
+    """Raise StreamError unless ``text`` can be opened on this computer, see `open_destination`."""
+    _kind_and_place(text, overwrite)
 
 
-def open_destination(text: str) -> Publisher:
+def open_destination(text: str, overwrite: bool = False) -> Publisher:
     """Begin a stream.
 
     Parameters
     ----------
     text : KIND or KIND:WHERE (docs/streams.md).
+    overwrite : whether to replace a file that holds an earlier recording.
 
     Raises
     ------
     StreamError
-        If there is no such kind, what it needs is not installed, or the place cannot be taken.
+        If there is no such kind, what it needs is not installed, the place cannot be taken, or it is a file that is not
+        to be replaced.
     """
-    kind, where = _kind_and_place(text)
+    kind, where = _kind_and_place(text, overwrite)
     return kind.open(where)
 
 
-def _kind_and_place(text: str) -> tuple[_Kind, str]:
+def _kind_and_place(text: str, overwrite: bool) -> tuple[_Kind, str]:
     name, colon, where = text.partition(":")
     kind = _KINDS.get(name)
     if kind is None or (colon and not where):
@@ -121,4 +130,10 @@ def _kind_and_place(text: str) -> tuple[_Kind, str]:
     kind.check(where)
     if find_spec(kind.module) is None:
         raise StreamError(f"--stream {name} needs {kind.module}, which is not installed: {kind.mend}")
+    file = kind.file(where)
+    if file is not None and not overwrite and file.is_file() and file.stat().st_size:
+        raise StreamError(
+            f"{file} holds an earlier recording: name another file, move this one, or allow it to be replaced "
+            "(`--overwrite`)"
+        )
     return kind, where

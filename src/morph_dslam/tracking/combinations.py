@@ -177,7 +177,7 @@ def check_options(run: TrackOptions) -> None:
         _refuse((message for refuses, message in OF_OBJECT if refuses(part)))
     _refuse((message for refuses, message in OF_RUN if refuses(run)))
     for destination in run.streams:
-        check_destination(destination)
+        check_destination(destination, run.overwrite)
 
 
 def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:

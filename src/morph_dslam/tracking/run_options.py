@@ -80,7 +80,7 @@ class TrackOptions(ObjectOptions):
     serve : port at which browsers on this computer see a live run; 0 for any.
     video : whether to draw the augmented video.
     drawing : what is drawn.
-    overwrite : whether to replace a run that is in the folder.
+    overwrite : whether to replace a run that is in the folder, and an earlier frame log or recording of a stream.
     streams : where results go as they come, for other programs (docs/streams.md).
     frame_log : file that gets a line of JSON for each frame, and each object, as soon as it is tracked.
     """

@@ -65,20 +65,22 @@ class StreamSink:
     Parameters
     ----------
     destinations : "ws:8767" say; or publishers of one's own.
+    overwrite : whether to replace a file that holds an earlier recording.
 
     Raises
     ------
     StreamError
-        If there is no such destination, what it needs is not installed, or it cannot be taken.
+        If there is no such destination, what it needs is not installed, it cannot be taken, or it is a file that is not
+        to be replaced.
     """
 
-    def __init__(self, destinations: Sequence[str | Publisher]) -> None:
+    def __init__(self, destinations: Sequence[str | Publisher], overwrite: bool = False) -> None:
         self._objects: dict[str, _ObjectMessages] = {}
         self._number = 0
         with ExitStack() as stack:
             self.publishers: list[Publisher] = []
             for where in destinations:
-                publisher = open_destination(where) if isinstance(where, str) else where
+                publisher = open_destination(where, overwrite) if isinstance(where, str) else where
                 stack.callback(publisher.close)
                 self.publishers.append(publisher)
             self._stack = stack.pop_all()

@@ -391,7 +391,7 @@ class _Job:
         """What sends results to other programs; None if nobody asked for it."""
         if not self._run.streams:
             return None
-        streams = stack.enter_context(StreamSink(self._run.streams))
+        streams = stack.enter_context(StreamSink(self._run.streams, self._run.overwrite))
         for publisher in streams.publishers:
             print(f"streamed to {publisher.place}", flush=True)
         return streams
