@@ -199,6 +199,25 @@ def test_names_that_ros_does_not_take_are_changed_and_stay_different():
     assert names == {"left_seal", "left_seal_2", "n2nd"}
 
 
+def test_each_frame_of_the_tree_has_one_parent():
+    """A support of one object, and objects, that would have the same frame."""
+    kept, model = Kept(), held_block_model()
+    shown = {name: StreamedObject(model, name) for name in ("seal", "seal left end", "camera optical frame")}
+    results = {name: tracked_result(model, 0.1, 0.002) for name in shown}
+    sink = StreamSink([kept]).begin(shown, CAMERA)
+    sink(tracked_frame(0, 0.0, **results))
+    made = topics(kept.scene, "/morph")
+    transforms = made["/tf"].make(kept.frames[0]).fields["transforms"]
+    children = [one.fields["child_frame_id"] for one in transforms]
+    assert len(children) == len(set(children)) >= 6
+    parents = {one.fields["header"].fields["frame_id"] for one in transforms}
+    assert "morph_camera_optical_frame" in parents
+    assert "morph_camera_optical_frame" not in children
+    for name, wrench in made.items():
+        if "/reactions/" in name:
+            assert wrench.make(kept.frames[0]).fields["header"].fields["frame_id"] in children
+
+
 class Node:
     """A node whose topics have a subscriber if the test says so."""
 

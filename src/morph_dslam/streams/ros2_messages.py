@@ -104,9 +104,12 @@ def topics(scene: SceneMessage, prefix: str) -> dict[str, Topic]:
     """
     frames = prefix.strip("/").replace("/", "_")
     camera, found = f"{frames}_camera_optical_frame", {}
+    names = _unique([part.name for part in scene.objects])
+    of_objects = _distinct([f"{frames}_{name}" for name in names], [camera])
+    of_supports = _support_frames(scene.objects, of_objects, [camera, *of_objects])
     parts = [
-        _ObjectTopics(info, f"{prefix}/{name}", camera, f"{frames}_{name}")
-        for info, name in zip(scene.objects, _unique([part.name for part in scene.objects]), strict=True)
+        _ObjectTopics(info, f"{prefix}/{name}", camera, frame, held)
+        for info, name, frame, held in zip(scene.objects, names, of_objects, of_supports, strict=True)
     ]
 
     def transforms(message: FrameMessage) -> RosMessage | None:
@@ -135,10 +138,12 @@ class _ObjectTopics:
     base : beginning of its topics.
     camera : the camera's frame.
     frame : the object's frame.
+    held : the frame of each support, by its name.
     """
 
-    def __init__(self, info: ObjectInfo, base: str, camera: str, frame: str) -> None:
+    def __init__(self, info: ObjectInfo, base: str, camera: str, frame: str, held: dict[str, str]) -> None:
         self._info, self._base, self._camera, self._frame = info, base, camera, frame
+        self._held = held
         self._supports = dict(zip(info.supports, _unique(info.supports), strict=True))
         inner = [one.name for one in info.inner]
         self._inner = dict(zip(inner, _unique(inner), strict=True))
@@ -169,8 +174,8 @@ class _ObjectTopics:
             return
         yield self._transform(message, self._camera, self._frame, now.camera_from_object)
         for support, reaction in now.reactions.items():
-            to = f"{self._frame}_{self._supports[support]}"
-            yield self._transform(message, self._frame, to, RigidTransform(np.eye(3), reaction.point))
+            pose = RigidTransform(np.eye(3), reaction.point)
+            yield self._transform(message, self._frame, self._held[support], pose)
 
     @staticmethod
     def _transform(message: FrameMessage, parent: str, child: str, pose: RigidTransform) -> RosMessage:
@@ -290,7 +295,7 @@ class _ObjectTopics:
                 return None
             reaction = now.reactions[support]
             parts = {"force": _vector(reaction.force), "torque": _vector(reaction.moment)}
-            header = _header(message, f"{self._frame}_{self._supports[support]}")
+            header = _header(message, self._held[support])
             fields = {"header": header, "wrench": RosMessage("geometry_msgs/msg/Wrench", parts)}
             return RosMessage("geometry_msgs/msg/WrenchStamped", fields)
 
@@ -333,8 +338,23 @@ def _plain(name: str) -> str:
 
 def _unique(names: Sequence[str]) -> list[str]:
     """The names as ROS takes them, each only once."""
-    found: list[str] = []
-    for plain in map(_plain, names):
+    return _distinct(list(map(_plain, names)))
+
+
+def _distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
+    """The names, numbered from the second on where one repeats or is ``taken``."""
+    found = list(taken)
+    for plain in names:
         candidates = chain([plain], (f"{plain}_{number}" for number in count(2)))
         found.append(next(name for name in candidates if name not in found))
+    return found[len(taken) :]
+
+
+def _support_frames(objects: Sequence[ObjectInfo], frames: Sequence[str], taken: Sequence[str]) -> list[dict[str, str]]:
+    """By object, the frame of each support; one name of all in the tree, where each frame has one parent."""
+    asked = [(k, support) for k, info in enumerate(objects) for support in info.supports]
+    plain = [f"{frames[k]}_{_plain(support)}" for k, support in asked]
+    found: list[dict[str, str]] = [{} for _ in objects]
+    for (k, support), name in zip(asked, _distinct(plain, taken), strict=True):
+        found[k][support] = name
     return found
