@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.report import identification_lines, summarise
+from morph_dslam.identification.run_values import values_of_run
 from morph_dslam.identification.values import FACTOR
 from morph_dslam.model import SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
@@ -81,6 +83,14 @@ def test_forces_by_a_known_load_do_not_have_the_errors_of_a_run() -> None:
     alone = MeasuredForces(run.model, curve, reaction_in_direction(run.model, "edge:x"))
     intervals = [identify(run.model, [t], moduli=True)[FACTOR].interval for t in (alone, replace(alone, run=run))]
     assert intervals[0] == intervals[1]
+
+
+@pytest.mark.parametrize("content", [None, "{}", "[]", "{", '{"one_over_the_sequence": 1}'])
+def test_a_summary_that_does_not_tell_is_named(tmp_path: Path, content: str | None) -> None:
+    if content is not None:
+        (tmp_path / "summary.json").write_text(content)
+    with pytest.raises(IdentificationError, match=r"summary\.json"):
+        values_of_run(tmp_path, run_of(LOADS, np.zeros(17)), ["a"], measured=False)
 
 
 def test_a_run_with_unknown_loads_is_refused_by_the_name_of_the_option() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from morph_dslam.errors import IdentificationError
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.identify import AT_THE_END
 from morph_dslam.identification.prior import KnownValues
+from morph_dslam.io.text import read_text
 from morph_dslam.model import Parameter
 
 Array = NDArray[np.float64]
@@ -33,11 +35,11 @@ def values_of_run(
     Raises
     ------
     IdentificationError
-        If nothing else was measured, and the run found a parameter at an end of its range, or frames of it contradict
-        each other in one.
+        If the run's `summary.json` cannot be read. If nothing else was measured, and the run found a parameter at an
+        end of its range, or frames of it contradict each other in one.
     """
     folder = Path(folder)
-    found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["one_over_the_sequence"]
+    found = _one_over_the_sequence(folder / "summary.json")
     of_model = {parameter.name: parameter for parameter in run.model.parameters}
     apart = [each["name"] for each in found if each["name"] in names and not each.get("is_one_value", True)]
     if apart and not measured:
@@ -68,6 +70,20 @@ def values_of_run(
     if covariance is None:  # k times the variances is never less than a covariance, whatever it is
         covariance = (len(kept) if measured else 1) * np.diag(std**2)
     return KnownValues(kept, values, covariance), []
+
+
+def _one_over_the_sequence(summary: Path) -> list[dict[str, Any]]:
+    """What a summary says of the parameters that are one over the sequence."""
+    try:
+        content = json.loads(read_text(summary, "summary of the run", IdentificationError))
+    except ValueError as error:
+        raise IdentificationError(f"{summary} is damaged ({error}): track again") from error
+    found = content.get("one_over_the_sequence") if isinstance(content, dict) else None
+    if not isinstance(found, list):
+        raise IdentificationError(
+            f"{summary} does not say what is one over the sequence, as `morph track` writes it: track again"
+        )
+    return found
 
 
 def _covariance(run: Run, names: Sequence[str]) -> Array | None:
