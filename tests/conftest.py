@@ -53,6 +53,20 @@ def refused(capsys):
 
 
 @pytest.fixture
+def ends_in_time():
+    """Raises in a test that still waits after two minutes, for a message that does not come say; it would hang all."""
+
+    def late(*_):
+        raise TimeoutError("the test still waits after two minutes")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(120)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
 def interruptible():
     """As in a terminal; what a shell runs in the background ignores Ctrl-C, and so do the tests there."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

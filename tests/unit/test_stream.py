@@ -38,6 +38,8 @@ from tests.support.streamed import (
 )
 from tests.support.stretched_block import SIZE
 
+pytestmark = pytest.mark.usefixtures("ends_in_time")
+
 client = stream_example("client")
 #: Of a client that takes messages of any size and reads one ahead.
 PLAIN = {"max_size": None, "compression": None, "max_queue": 1}

@@ -25,6 +25,8 @@ from tests.support.streamed import (
     vertices_at,
 )
 
+pytestmark = pytest.mark.usefixtures("ends_in_time")
+
 sample = stream_example("openigtlink")
 POINTS = np.array([[0.0, 1.0, 2.5], [3.0, -4.0, 5.0], [6.0, 7.0, 8.0], [-1.5, 0.0, 0.25]])
 TRIANGLES = np.array([[0, 1, 2], [2, 1, 3]])
