@@ -2,6 +2,7 @@
 
 import re
 import struct
+from datetime import datetime, timedelta
 
 import cv2
 import numpy as np
@@ -295,6 +296,19 @@ def test_the_unit_of_names_is_that_of_a_camera_s_rate(tmp_path, parts, start, fp
     np.testing.assert_allclose([frame.timestamp for frame in source], taken, rtol=0, atol=1.001e-3)
     assert source.fps == pytest.approx(fps, rel=0.05)
     assert notes_of_source(source, readout_s=0.03) == ()
+
+
+@pytest.mark.parametrize("parts", ["{:%Y%m%d%H%M%S}", "{:%Y%m%d%H%M%S}{milli:03}", "{:%Y%m%d%H%M%S%f}"])
+def test_names_that_are_dates_are_times(tmp_path, parts):
+    """Across the end of a minute, of a day and of a leap month, by numpy's own dates."""
+    step = 1.0 if "f" not in parts and "milli" not in parts else 0.1
+    start = datetime(2024, 2, 29, 23, 59, 58)
+    dates = [start + k * timedelta(seconds=step) for k in range(30)]
+    for date in dates:
+        cv2.imwrite(str(tmp_path / f"{parts.format(date, milli=date.microsecond // 1000)}.png"), grey(1))
+    found = [frame.timestamp for frame in open_source(tmp_path)]
+    expected = (np.array(dates, dtype="datetime64[us]") - np.datetime64(0, "us")) / np.timedelta64(1, "s")
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 def test_long_numbers_that_follow_each_other_are_those_of_frames(tmp_path):

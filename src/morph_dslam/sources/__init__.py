@@ -107,9 +107,10 @@ def open_source(
     Parameters
     ----------
     path : a folder of images, whose frames are numbered by the last number in each file name (`001.jpg` is
-        frame 1), or from 0 if all names are times (`1305031100.5.png`, in seconds, or 13 digits or more, in
-        milli-, micro- or nanoseconds); a folder in the layout of TUM RGB-D, EuRoC or 7-Scenes; a video file, or a
-        ROS 1 or ROS 2 bag, with `#topic` after its name where it holds several, whose frames are numbered from 0
+        frame 1), or from 0 if all names are times (`1305031100.5.png`, in seconds, a date as
+        `20240131123059800.png`, or 13 digits or more, in milli-, micro- or nanoseconds); a folder in the layout of TUM
+        RGB-D, EuRoC or 7-Scenes; a video file, or a ROS 1 or ROS 2 bag, with `#topic` after its name where it holds
+        several, whose frames are numbered from 0
     first, last : range of frame numbers, both included; open ends by default
     fps : frames a second of numbered images, which nothing else tells; 30 by default
     depth_per_metre : values a metre of the depth images, 1000 for millimetres; as the layout has them by default

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 
@@ -43,6 +44,8 @@ SEVEN_SCENES_FPS = 30.0
 _SECONDS, _PARTS = re.compile(r"\d+\.\d+", re.ASCII), re.compile(r"\d{13,}", re.ASCII)
 #: Parts a second that whole numbers may count: milliseconds, microseconds or nanoseconds.
 _UNITS = (10**3, 10**6, 10**9)
+#: Names that are dates, as 20240131123059800: year, month, day, hour, minute, second, and parts of a second.
+_DATE, _DATE_FORMAT = re.compile(r"((?:19|20)\d{12})(\d{3}|\d{6})?", re.ASCII), "%Y%m%d%H%M%S"
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")
 
 
@@ -228,8 +231,25 @@ def _timed_images(folder: Path) -> list[tuple[float, Path]]:
             )
         images[time] = path
     times = sorted(images)
+    if (dated := _of_dates([str(time) for time in times])) is not None:
+        return [(seconds, images[time]) for seconds, time in zip(dated, times, strict=True)]
     unit = 1 if kind is _SECONDS else _parts_a_second(times)
     return [(float(time / unit), images[time]) for time in times] if unit else []
+
+
+def _of_dates(names: Sequence[str]) -> list[float] | None:
+    """Seconds since 1970 of names that are dates, taken to be in UTC; None if not all are."""
+    found = []
+    for name in names:
+        matched = _DATE.fullmatch(name)
+        try:
+            date = datetime.strptime(matched[1], _DATE_FORMAT) if matched else None
+        except ValueError:  # no such month, day or hour
+            date = None
+        if matched is None or date is None:
+            return None
+        found.append(date.replace(tzinfo=UTC).timestamp() + float(f"0.{matched[2] or 0}"))
+    return found
 
 
 def _parts_a_second(times: Sequence[Decimal]) -> int | None:
