@@ -44,9 +44,9 @@ MOST_ROUNDS = 3
 MOST_TAKEN = 4
 #: So many standard deviations tell two places apart.
 SIGNIFICANT = 3.0
-#: Share of the latest frame in the usual spread, which is no smaller than the second number, pixels: the reference
-#: picture itself, compared with its rendering, agrees as no other frame does.
-LEARNING_RATE, LEAST_USUAL_PX = 0.05, 0.1
+#: Share of the latest frame in the usual spread. One that agrees far less closely counts as twice as loose as usual, or
+#: by that much more, pixels.
+LEARNING_RATE, LEAST_RISE_PX = 0.05, 0.1
 
 
 class Recovery:
@@ -70,12 +70,13 @@ class Recovery:
         if not np.isfinite(spread):
             return
         if np.isnan(self._usual_px):
-            self._usual_px = max(spread, LEAST_USUAL_PX)
+            self._usual_px = spread
         if self.partly_hidden(attempt):
             return
-        # A frame that agrees far less closely does not make that usual at once.
-        self._usual_px += LEARNING_RATE * min(spread - self._usual_px, self._usual_px)
-        self._usual_px = max(self._usual_px, LEAST_USUAL_PX)
+        rise = spread - self._usual_px
+        if self.is_loose(attempt):
+            rise = min(rise, max(self._usual_px, LEAST_RISE_PX))
+        self._usual_px += LEARNING_RATE * rise
 
     def doubt(self, attempt: PoseHypothesis) -> float:
         """By how much, pixels, the points that agree may be off together; 0 where nothing is doubtful.
