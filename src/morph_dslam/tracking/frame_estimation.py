@@ -41,9 +41,9 @@ REACHES, USUAL_EXTENT_PX, MOST_LARGER = (28, 14, 7, 4), 250.0, 2.5
 CLEARLY_BETTER, MUCH_BETTER = 0.95, 0.8
 #: Other shapes are tried on at least so many points, where there are as many, and at most twice as many.
 SCOUTED = 80
-#: A shape is measured again if a comparison has changed a parameter by more than so many standard deviations; at most
-#: so often.
-CHANGED, MOST_COMPARISONS = 3.0, 2
+#: A shape is measured again where what windows miss of its change is more than this share of the noise of all points
+#: together, a standard deviation of whatever they tell best; at most so often.
+MISSED_SHARE, MOST_COMPARISONS = 0.5, 2
 #: Depths this many times as far as the points have the object are in another unit, or of another camera.
 MOST_TIMES = 1.5
 
@@ -90,21 +90,23 @@ class FrameEstimation:
             return self._trimmed(measurement, state, prior, picture.motion)
 
     def correct_shape(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
-        """Measure again in the state that was found, as long as a comparison changes its shape clearly.
+        """Measure again in the state that was found, as long as windows miss a part of the change that would show.
 
         A window shows the mean of what moves in it. Of a change of shape that varies from one patch to the next, a
         share is missing after each comparison: after the next one, that share of the share.
         """
         for _ in range(MOST_COMPARISONS):
-            estimate, found = attempt.estimate, attempt.measurement
-            if found.drawing is None or reject(attempt, self._options) is not None:
+            state, found = attempt.estimate.state, attempt.measurement
+            if found.drawing is None or attempt.outline_alone or reject(attempt, self._options) is not None:
                 break
-            changed = np.abs(estimate.state.parameters - found.drawing.state.parameters)
-            if (changed <= CHANGED * estimate.parameter_std).all():
+            projected = self._reference.projected(state)
+            change = projected - self._reference.projected(found.drawing.state)
+            missed = self._reference.window_means.missed(change)[attempt.inliers]
+            noise = np.sqrt(self._reference.redundancy) * attempt.estimate.sigma_px
+            if np.linalg.norm(missed) <= MISSED_SHARE * noise:
                 break
-            left = zero_where_unknown(found.recorded - self._reference.projected(estimate.state))
-            offsets = np.where(attempt.inliers[:, None], left, 0.0)
-            attempt = self.correct(picture, estimate.state, offsets, attempt.prior)
+            offsets = np.where(attempt.inliers[:, None], zero_where_unknown(found.recorded - projected), 0.0)
+            attempt = self.correct(picture, state, offsets, attempt.prior)
         return attempt
 
     def _trimmed(

@@ -53,6 +53,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outline import Outline
 from morph_dslam.tracking.patches import interior, spread_corners, weaker_slope
 from morph_dslam.tracking.relocalization import Relocalizer
+from morph_dslam.tracking.window_means import WindowMeans
 
 Array = NDArray[np.float64]
 #: Slope of the image, grey levels a pixel, that tells texture from noise and shading; see `weaker_slope`.
@@ -280,6 +281,12 @@ class ReferenceView:
         """Finds the object by the view's features; these are taken when it is first asked for."""
         grey = self._views[0].picture.grey
         return Relocalizer(self._estimator, self.surface.model, grey, self._mask, self._mesh)
+
+    @cached_property
+    def window_means(self) -> WindowMeans:
+        """By how much windows miss motions of the points."""
+        depth = middle(self.points.in_camera(self.state)[:, 2])
+        return WindowMeans(self.points.rest, self._estimator.camera.fx / depth)
 
     @property
     def n_textured(self) -> int:
