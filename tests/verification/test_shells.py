@@ -287,16 +287,21 @@ def test_the_support_listed_first_holds_an_edge():
     np.testing.assert_allclose(both.field("displacement"), alone.field("displacement"), atol=1e-12)
 
 
+#: A plate that is clamped at one end, of so many cells along it, without its loads.
+PULLED_AT_A_CORNER = """
+    mesh = {{ generator = "plate", size = ["100 mm", "20 mm"], divisions = [{}, 2] }}
+    shell = {{ thickness = "0.5 mm" }}
+    material = {{ young = "1 GPa", poisson = 0.3 }}
+    sets = {{ tip = {{ nearest = ["100 mm", "20 mm", "0 mm"] }} }}
+    supports = [{{ kind = "clamped", on = "x_min" }}]
+"""
+
+
 def test_reactions_balance_the_loads():
     """Force and moment of a clamped edge, against those of a point load at its deformed place."""
-    shell = solved_shell("""
-        mesh = { generator = "plate", size = ["100 mm", "20 mm"], divisions = [4, 2] }
-        shell = { thickness = "0.5 mm" }
-        material = { young = "1 GPa", poisson = 0.3 }
-        sets = { tip = { nearest = ["100 mm", "20 mm", "0 mm"] } }
-        supports = [{ kind = "clamped", on = "x_min" }]
-        loads = [{ kind = "point", on = "tip", force = ["0 N", "10 mN", "30 mN"] }]
-    """)
+    shell = solved_shell(
+        PULLED_AT_A_CORNER.format(4) + 'loads = [{ kind = "point", on = "tip", force = ["0 N", "10 mN", "30 mN"] }]'
+    )
     load, place = np.array([0.0, 0.01, 0.03]), np.array([0.1, 0.02, 0.0]) + shell.displacement("tip")
     force, moment = shell.problem.reactions(shell.state.dofs, shell.state.mu, "x_min", np.zeros(3))
     np.testing.assert_allclose(force, -load, atol=1e-9)
@@ -308,15 +313,13 @@ def test_derivatives_of_reactions_balance_those_of_the_loads():
 
     The load is a parameter once, and once comes beside the study's.
     """
-    shell = solved_shell("""
-        mesh = { generator = "plate", size = ["100 mm", "20 mm"], divisions = [3, 2] }
-        shell = { thickness = "0.5 mm" }
-        material = { young = "1 GPa", poisson = 0.3 }
-        sets = { tip = { nearest = ["100 mm", "20 mm", "0 mm"] } }
-        supports = [{ kind = "clamped", on = "x_min" }]
+    shell = solved_shell(
+        PULLED_AT_A_CORNER.format(3)
+        + """
         loads = [{ kind = "point", on = "tip", force = ["0 N", "10 mN * a", "30 mN * a"] }]
         parameters = { a = { range = [0.0, 1.0], default = 1.0 } }
-    """)
+    """
+    )
     problem, dofs, mu = shell.problem, shell.state.dofs, shell.state.mu
     load, place = np.array([0.0, 0.01, 0.03]), np.array([0.1, 0.02, 0.0]) + shell.displacement("tip")
     tangent, applied = problem.linearise(dofs, mu), problem.residual_slopes(dofs, mu)

@@ -101,7 +101,7 @@ class Jobs:
         ----------
         kind : the command's name, such as "build".
         words : of the command line.
-        then : called when it has ended well, before the pages are told of it.
+        then : called when it has ended well, before its end is sent to the pages.
 
         Raises
         ------

@@ -26,7 +26,7 @@ from morph_dslam.studio.clicks import opened_model, overlay, stamp
 _LIVE_SOCKET = "camera.sock"
 #: Largest difference of two models that are the same, a share of the object's size: a build adds up in any order.
 _SAME = 1e-5
-#: Frames that pages are told at once.
+#: Frames that are sent to pages at once.
 _MOST_FRAMES = 1000
 _RESULT, _MODEL, _CAMERA = "result.h5", "model.morph", "camera.yaml"
 
