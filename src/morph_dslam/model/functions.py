@@ -99,36 +99,41 @@ class Functions(ABC):
 
 
 @njit(cache=True, nogil=True)
-def _products(mu, lower, upper, degrees):
-    """Each term's product of Chebyshev polynomials and its derivatives (1 + d, n_terms); ``degrees`` (d, n_terms)."""
-    d, n_terms = degrees.shape
-    degree = 0
-    for k in range(d):
-        for t in range(n_terms):
-            degree = max(degree, degrees[k, t])
-    table, knots = np.empty((3, degree + 1)), np.empty(0)
-    products, chosen = np.ones((1 + d, n_terms)), np.empty(n_terms)
-    for k in range(d):
-        fill_basis(CHEBYSHEV, 0, degree + 1, lower[k], upper[k], knots, mu[k], table)
-        values, slopes, of_k, line = table[0], table[1], degrees[k], products[k + 1]
-        for t in range(n_terms):
+def _fill_products(tables, degrees, first, end, products, chosen):
+    """Fill products of Chebyshev polynomials and their derivatives (1 + d, n), of the terms of a group.
+
+    Parameters
+    ----------
+    tables : (d, 3, p) values and derivatives of each parameter's polynomials.
+    degrees : (d, n_terms) of all terms' factors.
+    first, end : where the group's terms begin and end.
+    products, chosen : (1 + d, n), to be filled as far as there are terms, and (n,) for work.
+    """
+    products[:, : end - first] = 1.0
+    for k in range(len(degrees)):
+        values, slopes, of_k, line = tables[k, 0], tables[k, 1], degrees[k, first:end], products[k + 1]
+        for t in range(end - first):
             chosen[t] = values[of_k[t]]
             line[t] *= slopes[of_k[t]]
-        for row in range(1 + d):
+        for row in range(len(products)):
             if row != k + 1:
                 line = products[row]
-                for t in range(n_terms):
+                for t in range(end - first):
                     line[t] *= chosen[t]
-    return products
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _dot(a, b):
-    """Sum of products, in any order."""
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
+def _dots(a, b, c, first, second):
+    """Sums of the products, in any order, of each of three rows and each of two."""
+    a1, a2, b1, b2, c1, c2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(first)):
+        a1 += a[i] * first[i]
+        a2 += a[i] * second[i]
+        b1 += b[i] * first[i]
+        b2 += b[i] * second[i]
+        c1 += c[i] * first[i]
+        c2 += c[i] * second[i]
+    return a1, a2, b1, b2, c1, c2
 
 
 @njit(cache=True, nogil=True)
@@ -140,20 +145,35 @@ def evaluate_polynomials(mu, lower, upper, degrees, first_term, first_function, 
     mu : (d,) parameters.
     lower : (d,) lower ends of their ranges.
     upper : (d,) upper ends.
-    degrees : (d, n_terms) int, polynomial degree of each factor; the terms of one group after those of the other.
+    degrees : (d, n_terms) uint16, polynomial degree of each factor; the terms of one group after those of the other.
     first_term, first_function : (g + 1,) where the terms and functions of each of g groups begin.
     functions : (n,) which function each is, group by group.
     coefficients : those of all functions, one function after the other, as many as its group has terms.
     """
-    products = _products(mu, lower, upper, degrees)
-    result, begin = np.zeros((len(products), len(functions))), 0
+    d, highest, most, begin = len(mu), np.uint16(0), np.max(np.diff(first_term)), 0
+    for k in range(d):
+        for t in range(degrees.shape[1]):
+            highest = max(highest, degrees[k, t])
+    size = np.int64(highest) + 1
+    tables, knots, result = np.empty((d, 3, size)), np.empty(0), np.empty((1 + d, len(functions)))
+    products, chosen = np.empty((1 + d, most)), np.empty(most)
+    for k in range(d):
+        fill_basis(CHEBYSHEV, 0, size, lower[k], upper[k], knots, mu[k], tables[k])
     for group in range(len(first_term) - 1):
-        first, end = first_term[group], first_term[group + 1]
-        for i in range(first_function[group], first_function[group + 1]):
-            of_function = coefficients[begin : begin + end - first]
-            begin += end - first
-            for row in range(len(products)):
-                result[row, functions[i]] = _dot(products[row, first:end], of_function)
+        first, end, last = first_term[group], first_term[group + 1], first_function[group + 1] - 1
+        count = end - first
+        _fill_products(tables, degrees, first, end, products, chosen)
+        for i in range(first_function[group], last + 1, 2):
+            # Three rows times two functions at a pass; those that are not there are taken to be the last ones.
+            other = min(i + 1, last)
+            of_one, begin = coefficients[begin : begin + count], begin + (other - i) * count
+            of_other, begin = coefficients[begin : begin + count], begin + count
+            one, two = functions[i], functions[other]
+            for row in range(0, 1 + d, 3):
+                r, s = min(row + 1, d), min(row + 2, d)
+                (result[row, one], result[row, two], result[r, one], result[r, two], result[s, one], result[s, two]) = (
+                    _dots(products[row], products[r], products[s], of_one, of_other)
+                )
     return result
 
 
@@ -174,7 +194,7 @@ def _grouped(degrees: NDArray[np.int64], coefficients: Array) -> tuple[NDArray, 
     groups = [np.array(group) for group in of_group.values()] or [np.empty(0, dtype=np.int64)]
     terms = [np.flatnonzero(counts[:, group].any(axis=1)) for group in groups]
     return (
-        np.ascontiguousarray(degrees[np.concatenate(terms)].T, dtype=np.int32),
+        np.ascontiguousarray(degrees[np.concatenate(terms)].T, dtype=np.uint16),
         np.cumsum([0, *map(len, terms)]),
         np.cumsum([0, *map(len, groups)]),
         np.concatenate(groups),
