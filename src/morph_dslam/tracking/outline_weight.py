@@ -169,7 +169,8 @@ def _alike(pixels, counts, length):
         columns[begins[i] + a] = i
         for b in range(a):
             j = rows[b]
-            alike = np.exp(-np.hypot(pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1]) / length)
+            squared = (pixels[i, 0] - pixels[j, 0]) ** 2 + (pixels[i, 1] - pixels[j, 1]) ** 2
+            alike = np.exp(-np.sqrt(squared) / length)
             values[begins[i] + b] = values[begins[j] + a] = alike
             columns[begins[i] + b], columns[begins[j] + a] = j, i
     return values, columns, begins
@@ -181,10 +182,10 @@ def near_products(pixels, residuals, near):
     total, apart, pairs = 0.0, 0.0, 0
     for i in range(len(pixels)):
         for j in range(i):
-            distance = np.hypot(pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1])
-            if distance < near:
+            squared = (pixels[i, 0] - pixels[j, 0]) ** 2 + (pixels[i, 1] - pixels[j, 1]) ** 2
+            if squared < near * near:
                 pairs += 1
-                apart += distance
+                apart += np.sqrt(squared)
                 for k in range(residuals.shape[1]):
                     total += residuals[i, k] * residuals[j, k]
     if pairs == 0:
@@ -205,10 +206,10 @@ def beside_found(pixels, texture, found):
     result = np.ones(len(pixels), np.bool_)
     nearest, is_found = np.empty(NEIGHBOURS), np.empty(NEIGHBOURS, np.bool_)
     for i in range(len(pixels)):
-        count = 0
+        count, farthest = 0, np.inf
         for j in range(len(texture)):
             squared = (pixels[i, 0] - texture[j, 0]) ** 2 + (pixels[i, 1] - texture[j, 1]) ** 2
-            if not np.isfinite(squared) or (count == NEIGHBOURS and squared >= nearest[-1]):
+            if not squared < farthest:
                 continue
             count = min(count + 1, NEIGHBOURS)
             k = count - 1
@@ -216,6 +217,8 @@ def beside_found(pixels, texture, found):
                 nearest[k], is_found[k] = nearest[k - 1], is_found[k - 1]
                 k -= 1
             nearest[k], is_found[k] = squared, found[j]
+            if count == NEIGHBOURS:
+                farthest = nearest[-1]
         result[i] = is_found[:count].sum() >= min(count, LEAST_NEIGHBOURS)
     return result
 
@@ -226,5 +229,6 @@ def mean_correlation(pixels, length):
     total, count = 0.0, len(pixels)
     for i in range(count):
         for j in range(i):
-            total += np.exp(-np.hypot(pixels[i, 0] - pixels[j, 0], pixels[i, 1] - pixels[j, 1]) / length)
+            squared = (pixels[i, 0] - pixels[j, 0]) ** 2 + (pixels[i, 1] - pixels[j, 1]) ** 2
+            total += np.exp(-np.sqrt(squared) / length)
     return total / max(0.5 * count * (count - 1), 1.0)
