@@ -8,6 +8,8 @@ from numba import njit
 #: Places in the texture are whole numbers of these parts of a pixel.
 PARTS = 256
 _OF_LEVEL = np.float32(1.0 / PARTS**2)
+# Without a sign, no index is looked at for whether it counts from the end.
+_BITS, _MASK = np.uint32(8), np.uint32(255)
 
 
 @njit(cache=True, nogil=True)
@@ -29,9 +31,9 @@ def pack_texture(grey):
 @njit(cache=True, nogil=True, error_model="numpy")
 def grey_at(packed, x, y):
     """Grey level of a packed texture at a place in `PARTS` of a pixel, float32, bilinear; outside it is its border."""
-    column = int(min(max(x, 0.0), PARTS * (packed.shape[1] - 1)) + 0.5)
-    row = int(min(max(y, 0.0), PARTS * (packed.shape[0] - 1)) + 0.5)
-    return np.float32(interpolated(packed[row >> 8, column >> 8], column & 255, row & 255)) * _OF_LEVEL
+    column = np.uint32(min(max(x, 0.0), PARTS * (packed.shape[1] - 1)) + 0.5)
+    row = np.uint32(min(max(y, 0.0), PARTS * (packed.shape[0] - 1)) + 0.5)
+    return np.float32(interpolated(packed[row >> _BITS, column >> _BITS], column & _MASK, row & _MASK)) * _OF_LEVEL
 
 
 @njit(cache=True, nogil=True, inline="always")
