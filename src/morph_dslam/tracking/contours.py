@@ -232,11 +232,12 @@ def _spread(places, normals, apart, most):
             if count == most:
                 break
             free = True
-            for i in range(count):
+            for i in range(count - 1, -1, -1):  # those that were chosen last are mostly the nearest
                 other = chosen[i]
                 dx, dy = places[j, 0] - places[other, 0], places[j, 1] - places[other, 1]
-                alike = normals[j, 0] * normals[other, 0] + normals[j, 1] * normals[other, 1] > PARALLEL
-                if alike and dx * dx + dy * dy < least:
+                if not dx * dx + dy * dy < least:
+                    continue
+                if normals[j, 0] * normals[other, 0] + normals[j, 1] * normals[other, 1] > PARALLEL:
                     free = False
                     break
             if free:
