@@ -66,6 +66,9 @@ def interpolate(modes, corners, weights, found):
     corners, weights : (p, c) node indices and what each counts.
     found : (m, p, k), to be filled.
     """
+    if corners.shape[1] == 3:
+        _interpolate_on_triangles(modes, corners, weights, found)
+        return
     for i in range(found.shape[0]):
         for j in range(found.shape[1]):
             for k in range(found.shape[2]):
@@ -73,6 +76,19 @@ def interpolate(modes, corners, weights, found):
                 for c in range(corners.shape[1]):
                     total += weights[j, c] * modes[i, corners[j, c], k]
                 found[i, j, k] = total
+
+
+@njit(cache=True, nogil=True)
+def _interpolate_on_triangles(modes, corners, weights, found):
+    """`interpolate` with three corners written out: more of the modes' numbers are then on their way at a time."""
+    for i in range(found.shape[0]):
+        of_mode, line = modes[i], found[i]
+        for j in range(found.shape[1]):
+            # Without a sign: no index is looked at for whether it counts from the end.
+            a, b, c = np.uint64(corners[j, 0]), np.uint64(corners[j, 1]), np.uint64(corners[j, 2])
+            of_a, of_b, of_c = weights[j, 0], weights[j, 1], weights[j, 2]
+            for k in range(found.shape[2]):
+                line[j, k] = of_a * of_mode[a, k] + of_b * of_mode[b, k] + of_c * of_mode[c, k]
 
 
 @njit(cache=True, nogil=True)
