@@ -259,16 +259,3 @@ def trace_of_share(whole, part, scale):
             along = np.ascontiguousarray(vectors[:, k])
             trace += along @ part @ along / values[k]
     return trace
-
-
-def held_by(by_known: Array, measured: NDArray[np.int64]) -> Array:
-    """What sensors keep from an estimate (d + 6, d), for each change of the parameters.
-
-    Parameters
-    ----------
-    by_known : (d + 6, d + 6) how the estimate follows what is known of the unknowns.
-    measured : indices of the parameters that sensors tell.
-    """
-    found = np.zeros((len(by_known), len(by_known) - 6))
-    found[:, measured] = by_known[:, measured]
-    return found

@@ -127,6 +127,12 @@ class LinearCost:
         return (vectors / np.maximum(values, floor)) @ vectors.T
 
     @property
+    def inverse_of_seen(self) -> Array:
+        """H^-1 (n, n); nothing moves along what is not seen at all."""
+        values, vectors, floor = self._spectrum
+        return (vectors * np.where(values > floor, 1.0 / np.maximum(values, floor), 0.0)) @ vectors.T
+
+    @property
     def unseen(self) -> Array:
         """The part (n, n) of `inverse` that is not seen at all."""
         values, vectors, floor = self._spectrum

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.timing import stage
 from morph_dslam.tracking.compact_loads import LEAST_GAIN
-from morph_dslam.tracking.covariance import held_by, trace_of_share
+from morph_dslam.tracking.covariance import trace_of_share
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_starts import ShapeSearch
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.known_values import LEAST_SIGMA_PX, KnownParameters
-from morph_dslam.tracking.linearization import inverse_of_seen
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
 from morph_dslam.tracking.motion_blur import ReferenceBlur, blurred_paths, path_length
 from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, block_diagonal, window_correlation
@@ -160,24 +159,6 @@ class FrameEstimation:
         across = attempt.estimate.residuals[attempt.outline.valid]
         common = self._balance.in_common(attempt.outline, attempt.estimate.residuals)
         return Unexplained(common, float(np.sqrt(np.mean(np.sum(across**2, axis=1)))))
-
-    def held_from_outline(self, attempt: PoseHypothesis, past_information: Array) -> Array:
-        """What sensors keep from an estimate by the outline alone (d + 6, d), see `SystematicErrors.held`.
-
-        Parameters
-        ----------
-        attempt : that is accepted.
-        past_information : (d + 6, d + 6) with which earlier frames count in it.
-        """
-        seen, state, estimator = self.measured(attempt, correlated=False), attempt.estimate.state, self._estimator
-        hessian = (
-            past_information
-            + estimator.evaluate(
-                seen.points, seen.pixels, seen.weights, state, seen.normals, attempt.prior, seen.depths
-            )[1]
-        )
-        by_known = inverse_of_seen(hessian, estimator.scale) @ estimator.known_information(state.parameters)[0]
-        return held_by(by_known, estimator.known.indices)
 
     def search_other_shapes(self, attempt: PoseHypothesis) -> PoseHypothesis:
         """The attempt, or a clearly better explanation of its measurements reached from another shape."""

@@ -200,6 +200,7 @@ class KnownParameters:
     warnings : of the present frame.
     model : whose parameters they are.
     indices : of the parameters (k,) that are known in the present frame.
+    ever : (d,) which parameters were known in any frame so far.
     now : their values and standard deviations (k, 2), SI.
     squared_px : variance of an image coordinate, which turns likelihoods into costs in squared pixels.
     """
@@ -210,6 +211,7 @@ class KnownParameters:
         self.clock: KnownTime | None = None
         self.warnings: tuple[TimeOutside, ...] = ()
         self.indices, self.now = np.empty(0, dtype=np.int64), np.empty((0, 2))
+        self.ever = np.zeros(len(model.parameters), dtype=bool)
 
     def begin(self, frame: int | None, timestamp: float | None = None) -> None:
         """A frame of this number and time, seconds, begins: what the recording's table, or the time, says counts."""
@@ -250,11 +252,12 @@ class KnownParameters:
 
     def take(self, other: KnownParameters) -> None:
         """Know in the present frame what another one does, as a camera of a rig does what the rig knows."""
-        self.indices, self.now = other.indices, other.now
+        self.indices, self.now, self.ever = other.indices, other.now, self.ever | other.ever
 
     def _set(self, indices: NDArray[np.int64], values: Array) -> None:
         there = np.isfinite(values[:, 0])
         self.indices, self.now = indices[: len(values)][there], values[there]
+        self.ever[self.indices] = True
 
     def learn(self, sigma_px: float) -> None:
         """Take in how far an image coordinate is off in this frame, pixels; where no point is seen, nothing is learned.

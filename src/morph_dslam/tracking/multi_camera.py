@@ -257,7 +257,7 @@ class RigTracker:
         left = self._errors.unexplained(estimate, measured)
         blurred = [tracker.last_blurred for tracker in self.trackers]
         common = [rest.px if p is None else rest.total_px for rest, p in zip(left, blurred, strict=True)]
-        known = self.estimator.known_information(estimate.state.parameters)
+        known = self.estimator.known_information(estimate.state.parameters)[0]
         return self._errors.added(estimate, measured, prior, common, blurred, known), left
 
     def _found(
@@ -291,8 +291,7 @@ class RigTracker:
         errors, known = self._model_errors, self.estimator.known.indices
         if errors is not None:
             errors = errors.where_known(known, found.pose_from.is_of_frame_alone)
-        held = self._errors.held(known) if len(known) else None
-        return with_flat_sides(with_model_errors(found, errors, held), self._flat_sides)
+        return with_flat_sides(with_model_errors(found, errors, self._filter.held), self._flat_sides)
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""

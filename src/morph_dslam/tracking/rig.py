@@ -109,9 +109,9 @@ class RigEstimator:
         """What something else measures of parameters, which counts once and not once a camera."""
         return self._single[0].known
 
-    def known_information(self, parameters: Array) -> Array:
-        """What known parameters add to the Hessian (d + 6, d + 6) at parameters (d,)."""
-        return self._single[0].known_information(parameters)[0]
+    def known_information(self, parameters: Array) -> tuple[Array, Array]:
+        """What known parameters add to the Hessian at parameters (d,), and its covariance; as `Estimator` has it."""
+        return self._single[0].known_information(parameters)
 
     @property
     def scale(self) -> Array:

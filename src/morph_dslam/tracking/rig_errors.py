@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.tracking.covariance import held_by
 from morph_dslam.tracking.depth import SCALE_STD, PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
@@ -79,7 +78,6 @@ class RigErrors:
         self._points = [tracker.reference.points for tracker in trackers]
         self._estimators = [tracker.estimator for tracker in trackers]
         self._depths = CommonDepthScale(depth_std, self._scale)
-        self._by_known = np.zeros((len(self._scale),) * 2)
 
     def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
         """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
@@ -115,8 +113,8 @@ class RigErrors:
         hessian = np.sum([view.chain.T @ (frame.hessian + view.of_others) @ view.chain for view, frame in both], axis=0)
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
-        of_known = np.zeros_like(hessian) if known is None else known
-        hessian = hessian + of_known
+        if known is not None:
+            hessian = hessian + known
         gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
         stated = covariance
         for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
@@ -127,7 +125,6 @@ class RigErrors:
                 covariance = covariance + moved @ moved.T
         moved = self._moved_by_depths(gain, views)
         covariance = covariance + np.outer(moved, moved)
-        self._by_known = gain @ of_known
         if self._is_known:
             pushes = [
                 view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths) for view, frame in both
@@ -142,10 +139,6 @@ class RigErrors:
         for points, view in zip(self._points, views, strict=True):
             push += view.chain.T @ self._depths.push(points, view.estimate.state, nothing, view.depths)
         return gain @ push
-
-    def held(self, measured: NDArray[np.int64]) -> Array:
-        """As `SystematicErrors.held`, of the last estimate of all cameras."""
-        return held_by(self._by_known, measured)
 
     def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
         views, first = [], 0

@@ -5,6 +5,10 @@ reference view once; it is alike for points whose windows overlap there. The oth
 only that averages out. The past is a prior of the next frame, as in any Kalman filter in the information form.
 Beside it goes, for every point, how its own error has entered the estimate: these errors are "considered" but
 not estimated, as in Schmidt's filter (Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.4).
+
+What sensors tell of parameters, with the information K, keeps an estimate from a change of these that the images ask
+for, by H^-1 K. Where the past rests on sensors too, with the information I and what they kept from it, T, that is
+H^-1 (K + I T), also in a frame in which no sensor tells anything.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.estimator import Estimate, LinearCost, Prior, State
+from morph_dslam.tracking.known_values import KnownParameters
 from morph_dslam.tracking.noise import Correlation, Observations, PixelNoise, RigObservations, quadratic
 
 Array = NDArray[np.float64]
@@ -72,6 +77,7 @@ class _Errors:
     unseen : (n, n) covariance of what nothing tells of
     covariance : (n, n) from all of it.
     inverse : (n, n) of the cost's Hessian.
+    by_known : (n, n) what is known otherwise of parameters keeps from the estimate, of a change of each unknown.
     by_views : (k, n) by the number of a view that was left: derivative by what its points had put into the
         k parameters then.
     """
@@ -82,6 +88,7 @@ class _Errors:
     unseen: Array
     covariance: Array
     inverse: Array
+    by_known: Array
     by_views: dict[int, Array] = field(default_factory=dict)
 
 
@@ -93,8 +100,8 @@ class _Past:
     ----------
     mean : (k,), SI
     covariance : (k, k)
-    by_point, by_frames, by_factor, unseen, by_views : as in `_Errors`, (p, 2, k), (k, k), (c, k), (k, k) and
-        (k, k) each.
+    by_point, by_frames, by_factor, unseen, by_known, by_views : as in `_Errors`, (p, 2, k), (k, k), (c, k), (k, k),
+        (k, n) and (k, k) each.
     left : the views of ``by_views``, by number.
     """
 
@@ -104,6 +111,7 @@ class _Past:
     by_frames: Array
     by_factor: Array
     unseen: Array
+    by_known: Array
     by_views: dict[int, Array] = field(default_factory=dict)
     left: dict[int, _LeftPoints] = field(default_factory=dict)
 
@@ -210,6 +218,11 @@ class Fitter(Protocol[_Taken]):
     @property
     def model(self) -> ReducedModel: ...
 
+    @property
+    def known(self) -> KnownParameters: ...
+
+    def known_information(self, parameters: Array) -> tuple[Array, Array]: ...
+
     def fit(self, measured: _Taken, start: State, prior: Prior | None = None) -> Estimate: ...
 
     def linear(self, measured: _Taken, estimate: Estimate) -> LinearCost: ...
@@ -226,6 +239,8 @@ class SequenceFilter(Generic[Frame]):
     Attributes
     ----------
     past_information : (d + 6, d + 6) with which the past counts in the last estimate, as a term of its cost
+    by_known : (d + 6, d + 6) what unknown loads' prior and sensors keep from the last estimate, of a change of each
+        unknown
     keeps : whether the last estimate is the past of the next one
     forgot : whether the last frame made it give up what the frames before say of parameters that are one per sequence
     """
@@ -245,6 +260,13 @@ class SequenceFilter(Generic[Frame]):
         self._unobservable = np.zeros((len(self._constant),) * 2)
         self._conflicts = 0
         self.past_information, self.keeps, self.forgot = np.zeros((self._unknowns,) * 2), True, False
+        self.by_known = np.zeros((self._unknowns,) * 2)
+
+    @property
+    def held(self) -> Array | None:
+        """What sensors keep from the last estimate (d + 6, d), for each change of the parameters; None without any."""
+        told = self._estimator.known.ever
+        return self.by_known[:, :-6] * told if told.any() else None
 
     def change_points(self, change: PointChange) -> None:
         """Go on with the points of another view; what those so far have put into the past stays in it."""
@@ -272,7 +294,7 @@ class SequenceFilter(Generic[Frame]):
         self._noise.add(alone.residuals, measured, _taken(linear, alone.state, known))
         self._unobservable = self._without_effect(measured, linear, alone, known)
         errors = self._errors(measured, linear, alone.state, known)
-        by_itself = self._with_covariance(alone, measured, linear, errors, known)
+        by_itself, self.by_known = self._with_covariance(alone, measured, linear, errors, known), errors.by_known
         if not len(self._kept):
             return by_itself
         conflict = self._past is not None and self._contradicts(self._past, by_itself, len(self._kept))
@@ -293,6 +315,7 @@ class SequenceFilter(Generic[Frame]):
         fused = self._estimator.fit(measured, self._start(by_itself), prior)
         linear = self._estimator.linear(measured, fused)
         errors = self._errors(measured, linear, fused.state, known, past)
+        self.by_known = errors.by_known
         if not conflict:
             self._keep(fused, errors)
         fused = self._with_covariance(fused, measured, linear, errors, known, past)
@@ -370,6 +393,7 @@ class SequenceFilter(Generic[Frame]):
             fades @ self._of_kept(errors.by_frames) @ fades.T,
             errors.by_factor[:, k] @ fades.T,
             fades @ self._of_kept(errors.unseen) @ fades.T,
+            errors.by_known[k],
             {view: rows[:, k] @ fades.T for view, rows in errors.by_views.items()},
             {} if self._past is None else self._past.left,
         )
@@ -441,6 +465,7 @@ class SequenceFilter(Generic[Frame]):
         by_factor, unseen = np.zeros((0, self._unknowns)), np.zeros_like(linear.hessian)
         by_views: dict[int, Array] = {}
         by_point, hessian = np.sqrt(common) * linear.weighted_jacobian, linear.hessian.copy()
+        by_known = self._estimator.known_information(state.parameters)[0]
         if known is not None:
             information, by_factor = known.terms(state)[1], known.lasting_push
             hessian += information
@@ -455,6 +480,7 @@ class SequenceFilter(Generic[Frame]):
             by_factor = _longer(by_factor, len(self._past.by_factor))
             by_factor[: len(self._past.by_factor), kept] += self._past.by_factor @ weight
             unseen[np.ix_(kept, kept)] += weight @ self._past.unseen @ weight
+            by_known[kept] += weight @ self._past.by_known
             by_views = {view: rows @ weight for view, rows in self._past.by_views.items()}
         # Without a past it is the spread of this frame's points alone, which is known already.
         of_points = common * linear.spread if past is None else quadratic(by_point, measured.correlation)
@@ -468,7 +494,8 @@ class SequenceFilter(Generic[Frame]):
             by_views = {view: rows @ inverse[kept] for view, rows in by_views.items()}
             for view, rows in by_views.items():
                 covariance += rows.T @ self._past.left[view].covariance @ rows
-        return _Errors(by_point, by_frames, by_factor, unseen, covariance, inverse, by_views)
+        by_known = linear.inverse_of_seen @ by_known
+        return _Errors(by_point, by_frames, by_factor, unseen, covariance, inverse, by_known, by_views)
 
 
 def _taken(linear: LinearCost, state: State, known: Prior | None) -> float:

@@ -31,7 +31,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
-from morph_dslam.tracking.covariance import BoundPart, SharedErrors, held_by
+from morph_dslam.tracking.covariance import BoundPart, SharedErrors
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
@@ -120,7 +120,6 @@ class SystematicErrors:
         n_factors = 0 if self._moved is None else self._moved.shape[2]
         self._by_reference = np.zeros((size, n_factors))
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
-        self._by_known = self._kept_by_known = np.zeros((size, size))
         self._scale.forget_frames()
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
@@ -220,11 +219,8 @@ class SystematicErrors:
             covariance += by_blur @ by_blur.T
         by_scale = gain @ self._scale.push(self._points, estimate.state, past, depths)
         covariance += np.outer(by_scale, by_scale)
-        # Of this frame, whether or not later ones rest on it.
-        self._by_known = gain @ (known + past @ self._kept_by_known)
         if keeps:
             self._by_reference, self._by_model = by_reference, by_model
-            self._kept_by_known = self._by_known
             self._scale.keep(by_scale)
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
@@ -316,15 +312,8 @@ class SystematicErrors:
         along = np.einsum("pkn,pk->pn", frame.weighted_jacobian, blurred / np.sqrt(12.0)) @ chain
         return np.asarray(gain @ (self._common.factor.T @ along).T, dtype=np.float64)
 
-    def held(self, measured: NDArray[np.int64]) -> Array:
-        """What sensors keep from the last frame's estimate (d + 6, d), for each change of the parameters.
-
-        ``measured`` : indices of the parameters that they tell.
-        """
-        return held_by(self._by_known, measured)
-
     def deformation_errors(
-        self, state: State, of_model: Callable[[Array], tuple[Array, float]] | None
+        self, state: State, by_known: Array, of_model: Callable[[Array], tuple[Array, float]] | None
     ) -> Callable[[], Array]:
         """By how much what the deformation moves the pixels by (p, 2, c) may be off in the last frame that was kept.
 
@@ -335,10 +324,11 @@ class SystematicErrors:
         Parameters
         ----------
         state : of the frame.
+        by_known : (d + 6, d + 6), as of `SequenceFilter`.
         of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
             what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        by_reference, by_known = self.reference_factor * self._by_reference, self._by_known
+        by_reference = self.reference_factor * self._by_reference
         return partial(self._of_deformation, state, by_reference, by_known, of_model)
 
     def _of_deformation(

@@ -226,9 +226,8 @@ class Tracker:
                 hypothesis = self._refine(image, hypothesis, camera)
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
-            held = None if result.estimate is None else self._held(hypothesis)
             change = self._choose_view(image, hypothesis, result)
-            result = with_model_errors(result, self._errors_now(result.pose_from), held)
+            result = with_model_errors(result, self._errors_now(result.pose_from), self._filter.held)
             result = with_flat_sides(result, self._flat_sides)
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
@@ -450,15 +449,6 @@ class Tracker:
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
         return replace(result, view=number, motion=self._image.motion, modulus_std=self.options.modulus_std)
 
-    def _held(self, hypothesis: PoseHypothesis) -> Array | None:
-        """What sensors keep from an accepted estimate (d + 6, d), see `SystematicErrors.held`; None without any."""
-        measured, systematic = self.estimator.known.indices, self._view.systematic
-        if not len(measured):
-            return None
-        if systematic is None:
-            return self._view.estimation.held_from_outline(hypothesis, self._filter.past_information)
-        return systematic.held(measured)
-
     def _placed_by_map(self, camera: CameraLocalization) -> PosePrior | None:
         """The object's pose by the map; None for a free or moved object, or where the camera is lost."""
         return None if self._anchoring.has_moved else camera.pose_prior
@@ -483,7 +473,8 @@ class Tracker:
         systematic, errors = self._view.systematic, self._errors_now()
         if systematic is None:
             return None
-        return systematic.deformation_errors(self._last, None if errors is None else errors.in_common)
+        of_model = None if errors is None else errors.in_common
+        return systematic.deformation_errors(self._last, self._filter.by_known, of_model)
 
     def _errors_now(self, pose_from: PoseSource | None = None) -> ModelErrors | None:
         """Those of the model, by what is known in this frame; where its pose is from counts if it is given."""
