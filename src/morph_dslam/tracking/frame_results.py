@@ -201,7 +201,8 @@ def with_model_errors(
     by_mesh, by_reduction = seen * by_model.by_mesh, seen * by_model.by_reduction
     if held is not None:
         of_shape = of_shape + held @ (by_mesh + by_reduction) @ held.T
-        # The mesh's error is that of other states, where the other unknowns make good what they do in these.
+        covariance[d:, d:] += held[d:] @ by_mesh @ held[d:].T
+        # The mesh's error is that of other states, where the other parameters make good what they do in these.
         known = np.flatnonzero(held.any(axis=0))
         by_mesh = seen * errors.holding(known, held[np.ix_(known, known)]).at(mu).by_mesh
         made_good = made_good - held
