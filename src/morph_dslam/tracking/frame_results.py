@@ -147,14 +147,15 @@ def _with_systematic_errors(
         left = view.estimation.left_by_outline(hypothesis)
         return hypothesis.estimate, left.px, [ModelDoesNotExplain(left.px)] if left.is_failure else []
     left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
-    doubt_px, whole = recovery.doubt(hypothesis), not recovery.partly_hidden(hypothesis)
-    blurred = hypothesis.blurred
+    doubt_px, blurred = recovery.doubt(hypothesis), hypothesis.blurred
+    # Of points beside something that hides others, or of others that look alike, residuals are not the object's.
+    is_its_own = not (recovery.partly_hidden(hypothesis) or recovery.is_loose(hypothesis))
     # What is found on a blurred path errs with the texture: all that is left may be alike for neighbours.
     common_px = max(left.px, doubt_px if blurred is None else left.total_px)
     known = (past.past_information, past.keeps)
-    refuted = refuted_values(hypothesis, view.estimation, systematic, errors, doubt_px, whole)
-    # Learned from the images alone, and from residuals that are the object's.
-    learns = whole and blurred is None and not len(view.estimation.known.indices)
+    refuted = refuted_values(hypothesis, view.estimation, systematic, errors, doubt_px, is_its_own)
+    # Learned from the images alone.
+    learns = is_its_own and blurred is None and not len(view.estimation.known.indices)
     found, prior = hypothesis.estimate, hypothesis.prior
     others = hypothesis.point_depths, view.estimation.hessian_of_outline(hypothesis)
     estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, *others)
