@@ -18,7 +18,7 @@ from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.known_values import LEAST_SIGMA_PX, KnownParameters
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
 from morph_dslam.tracking.motion_blur import ReferenceBlur, blurred_paths, path_length
-from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, block_diagonal, window_correlation
+from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, block_diagonal, middle, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.other_tilt import LIKELIER, find_other_tilt
 from morph_dslam.tracking.outcomes import DepthNotUsed
@@ -100,7 +100,8 @@ class FrameEstimation:
                 break
             projected = self._reference.projected(state)
             change = projected - self._reference.projected(found.drawing.state)
-            missed = self._reference.window_means.missed(change)[attempt.inliers]
+            per_metre = self._estimator.camera.fx / middle(self._reference.points.in_camera(state)[:, 2])
+            missed = self._reference.window_means.missed(change, per_metre)[attempt.inliers]
             noise = np.sqrt(self._reference.redundancy) * attempt.estimate.sigma_px
             if np.linalg.norm(missed) <= MISSED_SHARE * noise:
                 break

@@ -285,8 +285,7 @@ class ReferenceView:
     @cached_property
     def window_means(self) -> WindowMeans:
         """By how much windows miss motions of the points."""
-        depth = middle(self.points.in_camera(self.state)[:, 2])
-        return WindowMeans(self.points.rest, self._estimator.camera.fx / depth)
+        return WindowMeans(self.points.rest)
 
     @property
     def n_textured(self) -> int:

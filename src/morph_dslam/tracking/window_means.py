@@ -23,10 +23,9 @@ class WindowMeans:
     Parameters
     ----------
     points : (p, 3) where they are on the undeformed object, metres.
-    pixels_per_metre : about how large it is in the image.
     """
 
-    def __init__(self, points: Array, pixels_per_metre: float) -> None:
+    def __init__(self, points: Array) -> None:
         count = min(NEIGHBOURS, len(points) - 1)
         nearest = KDTree(points).query(points, count + 1)
         distances, found = np.asarray(nearest[0]), np.asarray(nearest[1])
@@ -35,10 +34,13 @@ class WindowMeans:
         affine = np.concatenate([np.ones((*beside.shape[:2], 1)), beside / distances[:, -1:, None]], axis=2)
         # The value at a point of the affine function nearest to those about it.
         self._weights = np.linalg.pinv(affine)[:, 0]
-        squared = np.mean((pixels_per_metre * distances[:, 1:]) ** 2, axis=1)
-        self._shares = np.minimum(FLOW_WINDOW**2 / (6.0 * squared), 1.0)
+        self._squared = np.mean(distances[:, 1:] ** 2, axis=1)
 
-    def missed(self, motions: Array) -> Array:
-        """Of motions (p, 2), pixels, what windows miss (p, 2), roughly; 0 where it is not known."""
+    def missed(self, motions: Array, pixels_per_metre: float) -> Array:
+        """Of motions (p, 2), pixels, what windows miss (p, 2), roughly; 0 where it is not known.
+
+        ``pixels_per_metre`` : about how large the object is in the image in which the points move.
+        """
         about = np.einsum("pk,pkc->pc", self._weights, motions[self._rows])
-        return np.nan_to_num(self._shares[:, None] * (about - motions))
+        shares = np.minimum(FLOW_WINDOW**2 / (6.0 * pixels_per_metre**2 * self._squared), 1.0)
+        return np.nan_to_num(shares[:, None] * (about - motions))
