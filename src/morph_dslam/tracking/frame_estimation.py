@@ -92,7 +92,8 @@ class FrameEstimation:
         """Measure again in the state that was found, as long as windows miss a part of the change that would show.
 
         A window shows the mean of what moves in it. Of a change of shape that varies from one patch to the next, a
-        share is missing after each comparison: after the next one, that share of the share.
+        share is missing after each comparison: after the next one, that share of the share. One that would be rejected
+        does not take the place of the one before.
         """
         for _ in range(MOST_COMPARISONS):
             state, found = attempt.estimate.state, attempt.measurement
@@ -106,7 +107,10 @@ class FrameEstimation:
             if np.linalg.norm(missed) <= MISSED_SHARE * noise:
                 break
             offsets = np.where(attempt.inliers[:, None], zero_where_unknown(found.recorded - projected), 0.0)
-            attempt = self.correct(picture, state, offsets, attempt.prior)
+            again = self.correct(picture, state, offsets, attempt.prior)
+            if reject(again, self._options) is not None:
+                break
+            attempt = again
         return attempt
 
     def _trimmed(
