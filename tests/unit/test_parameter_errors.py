@@ -171,7 +171,9 @@ def test_the_shape_errs_by_what_a_sensor_keeps_from_it(model, certified):
     apart = found.image_covariance - plain.covariance
     along = np.mean((0.2 * errors[:, 1]) ** 2)
     assert apart[7, 7] == pytest.approx(along, rel=1e-9)
-    assert found.covariance[7, 7] - plain.covariance[7, 7] == pytest.approx(along, rel=1e-9), "of the pose that is stated"
+    assert found.covariance[7, 7] - plain.covariance[7, 7] == pytest.approx(along, rel=1e-9), (
+        "of the pose that is stated"
+    )
     assert np.linalg.eigvalsh(apart).min() > -1e-12 * np.trace(apart)
 
 

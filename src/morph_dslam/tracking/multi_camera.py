@@ -29,6 +29,8 @@ from morph_dslam.tracking.outcomes import (
     CameraIgnored,
     CameraLost,
     CamerasDisagree,
+    DepthNotUsed,
+    FewPointsAgree,
     FoundBy,
     KnownRefuted,
     ModelDoesNotExplain,
@@ -256,7 +258,10 @@ class RigTracker:
         """The common estimate with the errors in its covariance, and what it leaves of each camera's residuals."""
         left = self._errors.unexplained(estimate, measured)
         blurred = [tracker.last_blurred for tracker in self.trackers]
-        common = [rest.px if p is None else rest.total_px for rest, p in zip(left, blurred, strict=True)]
+        common = [
+            rest.total_px if paths is not None else max(rest.px, tracker.last_doubt_px)
+            for tracker, rest, paths in zip(self.trackers, left, blurred, strict=True)
+        ]
         known = self.estimator.known_information(estimate.state.parameters)[0]
         return self._errors.added(estimate, measured, prior, common, blurred, known), left
 
@@ -279,6 +284,8 @@ class RigTracker:
                 *([PastForgotten()] if self._filter.forgot else []),
                 *refuted,
                 *_blurred(results),
+                *_few_agree(results, measured),
+                *_depth_unused(results),
                 *([] if refuted else _not_explained(results, left)),
             ),
             unexplained_px=max(rest.px for rest in left),
@@ -379,6 +386,20 @@ def _blurred(results: list[FrameResult]) -> list[BlurredByMotion]:
     """The warning of motion blur of the camera that sees most of it, if one does."""
     found = [warning for result in results if (warning := result.warning(BlurredByMotion)) is not None]
     return sorted(found, key=lambda warning: -warning.path_px)[:1]
+
+
+def _few_agree(results: list[FrameResult], measured: RigObservations) -> list[FewPointsAgree]:
+    """The warning that few points agree of the camera whose points agree least, of those that count."""
+    counted = [result for result, view in zip(results, measured.views, strict=True) if view.weights.any()]
+    found = [warning for result in counted if (warning := result.warning(FewPointsAgree)) is not None]
+    return sorted(found, key=lambda warning: -warning.spread_px)[:1]
+
+
+def _depth_unused(results: list[FrameResult]) -> list[DepthNotUsed]:
+    """That depth does not count, which is asked of all cameras: of one it is elsewhere, or none has any."""
+    each = [result.warning(DepthNotUsed) for result in results if result.estimate is not None]
+    elsewhere = [warning for warning in each if warning is not None and warning.ratio is not None]
+    return elsewhere[:1] or [warning for warning in each[:1] if warning is not None and None not in each]
 
 
 def _not_explained(results: list[FrameResult], left: list[Unexplained]) -> list[TrackingWarning]:

@@ -123,6 +123,7 @@ class Tracker:
     last_seen : where the first view's points were in the last frame that was compared with it.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
     last_blurred : (p, 2), the paths over which motion smeared the points in it; None where it did no harm.
+    last_doubt_px : what the points that agreed in it may have in common, as of `Recovery.doubt`.
     is_taken : whether another object stands where this one would stand in a state, in the frame of the camera: there it
         is not found again after a loss. A `Session` of several objects sets it; None where no other is known.
 
@@ -178,6 +179,7 @@ class Tracker:
         self._history = StateHistory(camera, self.model.nodes.mean(axis=0))
         self.last_seen: Keyframe | None = None
         self.last_blurred: Array | None = None
+        self.last_doubt_px = 0.0
         self._views: ViewSet | None = None
         self._last = self._velocity_base = self._start = registration.state
         self._jumps_before: tuple[DisplacementJump, ...] = ()
@@ -439,6 +441,7 @@ class Tracker:
         number, has_moved = self._view.number, self._anchoring.has_moved
         told = (*self._history.warnings, *self.estimator.known.warnings)
         warnings = (*told, *warnings_of_place(has_moved, self.jumps, number, camera.why_lost))
+        self.last_doubt_px = 0.0 if rejection is not None else self._view.recovery.doubt(hypothesis)
         if rejection is not None:
             placed = self._placed_by_map(camera)
             result = lost_result(self.model, hypothesis, rejection, placed, warnings)
@@ -520,6 +523,7 @@ class Tracker:
             self._gaps.after_gap(timestamp)
         if self._views is not None:  # before the first frame nothing is followed that could be lost
             self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
+            self.last_doubt_px = 0.0
             self._n_lost += 1
             self._forget_loads()
         rejection = Rejection(RejectionReason.NO_PICTURE)

@@ -1,0 +1,74 @@
+"""What the cameras of a rig say of a frame, in the common result."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.registration.registration import Registration
+from morph_dslam.sources import Frame
+from morph_dslam.tracking.multi_camera import RigTracker
+from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.outcomes import DepthNotUsed, FewPointsAgree
+from morph_dslam.tracking.rig import RigCamera
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_depth, sheet_state
+
+MODEL = bent_sheet_model(22, 16)
+TURN = rotation_exp(np.array([0.02, 0.3, -0.05]))
+RIG = (
+    RigCamera(CAMERA, RigidTransform.identity()),
+    RigCamera(CAMERA, RigidTransform(TURN, np.array([0.0, 0.0, 0.6]) - TURN @ np.array([0.0, 0.0, 0.6]))),
+)
+STD = np.array([2e-4, 2e-3, 5e-4, 3e-4, 3e-4, 3e-4, 2e-4, 2e-4, 5e-4])
+
+
+class Scene:
+    """Pictures of both cameras: in the reference state, and later."""
+
+    def __init__(self) -> None:
+        film = SheetFilm(MODEL)
+        self.references, self.later = ([film.frame(part.seen(sheet_state(t))) for part in RIG] for t in (0.3, 0.32))
+
+    def tracker(self, **options):
+        known = Registration(MODEL, sheet_state(0.3), covariance=np.diag(STD**2))
+        return RigTracker(MODEL, RIG, known, TrackerOptions(**options), references=self.references)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+def test_few_points_of_a_camera_are_named_and_what_they_may_have_in_common_is_in_the_deviations(scene, monkeypatch):
+    results = []
+    for doubt_px in (0.0, 3.0):
+        rig = scene.tracker()
+        second = rig.trackers[1]
+
+        def doubted(*told, second=second, track=second.track, doubt_px=doubt_px):
+            result = track(*told)
+            second.last_doubt_px = doubt_px
+            return replace(result, warnings=(*result.warnings, FewPointsAgree(3.5))) if doubt_px else result
+
+        monkeypatch.setattr(second, "track", doubted)
+        results.append(rig.track(scene.later))
+    plain, found = results
+    assert plain.warning(FewPointsAgree) is None
+    assert found.warning(FewPointsAgree) == FewPointsAgree(3.5)
+    np.testing.assert_allclose(found.estimate.state.parameters, plain.estimate.state.parameters)
+    assert (found.estimate.parameter_std > 2.0 * plain.estimate.parameter_std).all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "ratio"), [(None, None), (1.0, 0.0), (1000.0, pytest.approx(1000.0, rel=0.01))], ids=str
+)
+def test_depth_that_does_not_count_is_named_and_a_camera_beside_one_that_has_depth_needs_none(scene, factor, ratio):
+    """No camera has depth, the first one has it in metres, or in millimetres; 0 where nothing is to be said."""
+    frames = [Frame(0, 0.0, image) for image in scene.later]
+    if factor is not None:
+        depth = np.float32(factor) * sheet_depth(MODEL, sheet_state(0.32), np.random.default_rng(0))
+        frames[0] = replace(frames[0], depth=depth)
+    found = scene.tracker(use_depth=True).track(frames).warning(DepthNotUsed)
+    assert found is None if ratio == 0.0 else found is not None and found.ratio == ratio
