@@ -70,3 +70,9 @@ def test_paths_of_a_run_may_be_text():
     assert (run.folders, run.stream_names) == ((Path("run"),), ("m",))
     # These are no mere paths.
     assert (run.frames, run.camera) == ("film.mp4", "camchain.yaml#cam0")
+
+
+def test_frames_become_reference_views_where_there_is_room_for_one_beside_the_first():
+    assert md.TrackerOptions().makes_views
+    assert not md.TrackerOptions(max_views=1).makes_views
+    assert not md.TrackerOptions(new_views=False).makes_views

@@ -108,6 +108,11 @@ class TrackerOptions(CheckedOptions):
     discrepancy: DiscrepancyOptions = field(default_factory=DiscrepancyOptions)
     estimation: EstimationOptions = field(default_factory=EstimationOptions)
 
+    @property
+    def makes_views(self) -> bool:
+        """Whether frames may become reference views: there is room for one beside the first."""
+        return self.new_views and self.max_views > 1
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.use_texture:

@@ -60,7 +60,7 @@ def _makes_views(part: PlacedObject, results: RunResults) -> bool:
     """Whether frames may become reference views: those of one camera, in which more than the outline is followed."""
     tracked = [result for result in results.results if result.tracked]
     by_outline = bool(tracked) and all(result.by_outline for result in tracked)
-    return part.options.new_views and len(part.cameras) == 1 and not by_outline
+    return part.options.makes_views and len(part.cameras) == 1 and not by_outline
 
 
 def _inputs(run: TrackOptions, files: ObjectOptions, map_path: Path | None) -> dict[str, Any]:

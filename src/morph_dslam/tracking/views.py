@@ -367,8 +367,7 @@ class ViewSet:
         unexplained_px : see `new_view.is_known_well`.
         """
         self._n_frames, self._pause = self._n_frames + 1, max(self._pause - 1, 0)
-        makes_views = self._options.new_views and self._options.max_views > 1
-        if not makes_views or self.active.reference.outline_alone:
+        if not self._options.makes_views or self.active.reference.outline_alone:
             return None
         if self._begun is not None or self._n_frames % CHECK_EVERY:
             with stage("views"):
