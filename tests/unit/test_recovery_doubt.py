@@ -9,6 +9,7 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX
 from morph_dslam.tracking.hypothesis import Image, reject
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
@@ -104,6 +105,16 @@ def test_a_pose_that_is_held_says_nothing_of_a_frame(share, followed, believed):
     torn = attempt(share, 3.5, prior=object(), alike=True)
     assert (still.reject(torn, followed) is None) == believed
     assert still.doubt(attempt(0.4, 0.5, prior=object())) == pytest.approx(0.4)
+
+
+def test_the_reference_picture_itself_does_not_say_what_is_usual():
+    """It agrees with itself to a hundredth of a pixel; later frames spread by more than a pixel, all of them alike."""
+    first = new()
+    first.learn(attempt(1.0, LEAST_SPREAD_PX))
+    assert not first.is_loose(attempt(0.95, 2.0))
+    first.learn(attempt(0.95, 2.0))
+    assert not first.is_loose(attempt(0.95, 2.0))
+    assert first.is_loose(attempt(0.95, 21.0))
 
 
 def test_places_where_no_point_agrees_when_they_are_compared_again_are_no_places():

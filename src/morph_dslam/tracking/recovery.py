@@ -12,6 +12,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.starts import shape_starts, solve_pnp
 from morph_dslam.timing import stage
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import MOST_AGREE, Image, PoseHypothesis, agree, reject
 from morph_dslam.tracking.measurement import LARGEST_CORRECTION_PX
@@ -65,9 +66,12 @@ class Recovery:
         self._usual_px, self._n_doubted = np.nan, 0
 
     def learn(self, attempt: PoseHypothesis) -> None:
-        """Take in how closely the points agreed in a frame in which the object was followed."""
+        """Take in how closely the points agreed in a frame in which the object was followed.
+
+        The reference picture itself, which is often the first frame, agrees with itself, and tells nothing of others.
+        """
         spread = attempt.estimate.sigma_px
-        if not np.isfinite(spread):
+        if not LEAST_SPREAD_PX < spread < np.inf:
             return
         if np.isnan(self._usual_px):
             self._usual_px = spread
