@@ -1,11 +1,16 @@
 """What a frame's result states, and what later frames learn from it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from morph_dslam.model import SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.unknown_loads import UnknownLoads, with_unknown_loads
+from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
@@ -17,8 +22,9 @@ from morph_dslam.tracking.outcomes import FewPointsAgree
 from morph_dslam.tracking.recovery import Recovery
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA, sheet_state
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
 
 MODEL = bent_sheet_model(22, 16)
 REFERENCE, LATER = sheet_state(0.1), sheet_state(0.6)
@@ -74,3 +80,42 @@ def test_frames_that_are_taken_for_what_looks_like_them_say_nothing_of_the_refer
     for _ in range(5):
         assert view.result(view.wave(0.8)).warning(FewPointsAgree) is None
     assert view.result().reference_factor > 1.5 * after.reference_factor
+
+
+def sheet_with_load():
+    """The sheet with one unknown load, which moves one of its halves out of the plane, more towards the end."""
+    constant = ParameterFunctions(MODEL.lower, MODEL.upper, np.zeros((1, 3), dtype=np.int64), np.ones((1, 1)))
+    moved = np.zeros((1, len(MODEL.nodes), 3))
+    moved[0, :, 2] = np.maximum(MODEL.nodes[:, 0], 0.0) ** 2
+    responses = {
+        "displacement": SeparatedField(moved, constant),
+        "compliance_root": SeparatedField(np.ones((1, 1, 1)), constant),
+    }
+    every = np.arange(len(MODEL.nodes))
+    loads = UnknownLoads("", False, every, np.ones((len(every), 3, 1)), np.ones((1, 6)), responses)
+    return with_unknown_loads(replace(MODEL, stresses={}, unknown_loads=loads))
+
+
+def test_a_result_does_not_rest_on_what_its_own_frame_teaches_of_unknown_loads():
+    """The next frame's prior is by a hundred times surer of the loads than the first one's, or as sure."""
+    model, film, found = sheet_with_load(), SheetFilm(MODEL), []
+    first = film.frame(REFERENCE)
+    second = film.frame(LATER)
+    state = replace(REFERENCE, parameters=np.append(REFERENCE.parameters, 0.0))
+    for times in (1.0, 1e4):
+        known = Registration(model, state, covariance=np.diag(np.insert(STD, 3, 1e-3) ** 2))
+        tracker = Tracker(model, CAMERA, known, TrackerOptions(use_unknown_loads=True), reference=first)
+        loads = tracker.estimator.loads
+        assert loads is not None
+        surer, learned = loads.squared_px * times, loads.learn
+
+        def learn(*told, loads=loads, surer=surer, learned=learned):
+            learned(*told)
+            loads.squared_px = surer
+
+        loads.learn = learn  # type: ignore[method-assign]
+        estimate = tracker.track(second).estimate
+        assert estimate is not None
+        assert loads.squared_px == surer
+        found.append(estimate.parameter_std)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)

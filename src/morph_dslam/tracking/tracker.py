@@ -228,6 +228,10 @@ class Tracker:
                 hypothesis = self._refine(image, hypothesis, camera)
             self._update(image, hypothesis, rejection, camera)
             result = self._result(hypothesis, found_by, rejection, camera)
+            if rejection is None and self.estimator.loads is not None:
+                # Now only: the result is what the frame tells beside the prior that it had.
+                found = hypothesis.estimate
+                self.estimator.loads.learn(found.state.parameters, found.covariance, found.sigma_px)
             change = self._choose_view(image, hypothesis, result)
             result = with_model_errors(result, self._errors_now(result.pose_from), self._filter.held)
             result = with_flat_sides(result, self._flat_sides)
@@ -574,8 +578,6 @@ class Tracker:
                 shape = self.reference.points.field.value(estimate.state.parameters)
                 depth = middle(self.reference.points.in_camera(estimate.state)[:, 2])
                 self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
-        if self.estimator.loads is not None:
-            self.estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last = estimate.state
         self._history.add(self._last)
