@@ -117,6 +117,12 @@ def test_the_reference_picture_itself_does_not_say_what_is_usual():
     assert first.is_loose(attempt(0.95, 21.0))
 
 
+def test_points_too_few_to_have_a_spread_say_nothing_of_what_they_have_in_common(recovery):
+    few = attempt(0.05, np.inf, prior=object())
+    assert recovery.doubt(few) == 0.0
+    assert not recovery.is_loose(few)
+
+
 def test_places_where_no_point_agrees_when_they_are_compared_again_are_no_places():
     """Seen from where a print's period puts the object, the shape found there may have nothing in common with it."""
     rng = np.random.default_rng(3)

@@ -89,16 +89,16 @@ class Recovery:
         closely as usual, something else is in the windows of many: what their residuals have more than usual
         is no noise that averages out.
         """
-        if np.isnan(self._usual_px):
+        spread = attempt.estimate.sigma_px
+        if np.isnan(self._usual_px) or not np.isfinite(spread):  # so few points that nothing is left of them
             return 0.0
         if self.is_loose(attempt):
-            return float(np.sqrt(attempt.estimate.sigma_px**2 - self._usual_px**2))
+            return float(np.sqrt(spread**2 - self._usual_px**2))
         if self._known_by_map(attempt):  # fewer points tell as much
             if agree(attempt, self._options.least_share):
                 return 0.0
         elif agree(attempt, MOST_AGREE) and not self.partly_hidden(attempt):
             return 0.0
-        spread = attempt.estimate.sigma_px
         if spread < CLOSE_TO_USUAL * self._usual_px:
             return 0.0
         return float(np.sqrt(spread**2 - self._usual_px**2))
@@ -133,7 +133,7 @@ class Recovery:
         """Whether points agree far less closely than usual: as where those of a regular print are taken for others."""
         if attempt.outline_alone or np.isnan(self._usual_px):
             return False
-        return attempt.estimate.sigma_px > max(LOOSE_PX, LOOSE_TO_USUAL * self._usual_px)
+        return max(LOOSE_PX, LOOSE_TO_USUAL * self._usual_px) < attempt.estimate.sigma_px < np.inf
 
     def _known_by_map(self, attempt: PoseHypothesis) -> bool:
         """Whether the frame's camera and the map say where it is; a pose that is held says nothing of a frame."""
