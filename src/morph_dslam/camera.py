@@ -173,7 +173,9 @@ class _Fisheye:
                     break
                 angle = angle - (radius - distance) / slope
             radius, _ = self._radius(angle)
-            good = (np.abs(radius - distance) <= 1e3 * TOLERANCE) & (angle < min(self.fold, 0.5 * np.pi))
+            # Beyond the fold the search may end at a negative angle, on the other side of the axis.
+            is_before = (angle >= 0.0) & (angle < min(self.fold, 0.5 * np.pi))
+            good = is_before & (np.abs(radius - distance) <= 1e3 * TOLERANCE)
             scale = np.where(distance > 0.0, np.tan(angle) / distance, 1.0)
         return np.where(good[:, None], scale[:, None] * image_points, np.nan)
 

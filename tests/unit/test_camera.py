@@ -116,6 +116,19 @@ def test_the_inverse_of_a_lens_ends_at_its_fold_though_the_image_grows_again_beh
     assert np.isnan(camera.undistort_pixels(just_beyond)).all()
 
 
+@pytest.mark.parametrize("k", [(-0.2, 0.0, 0.0, 0.0), (-0.1, -0.05, 0.0, 0.0), (-0.05, -0.03, 0.01, -0.004)])
+def test_a_fisheye_gives_the_pixels_within_its_largest_radius_a_ray_and_no_others(k):
+    lens = Camera(640, 480, 300.0, 300.0, 319.5, 239.5, k, "fisheye")
+    angles = np.linspace(0.0, np.pi / 2, 200_001)
+    largest = np.max(angles * (1.0 + sum(c * angles ** (2 * i + 2) for i, c in enumerate(k))))
+    columns, rows = np.meshgrid(np.arange(0.0, 640.0, 3.0), np.arange(0.0, 480.0, 3.0))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    radius = np.hypot(*(pixels - [319.5, 239.5]).T) / 300.0
+    beyond = radius > largest
+    assert 0.02 < beyond.mean() < 0.5
+    np.testing.assert_array_equal(np.isnan(lens.undistort_pixels(pixels)).all(axis=1), beyond)
+
+
 @pytest.mark.parametrize("distortion", [RATIONAL.distortion, (0.25, -0.1, 0.0, 0.0, 0.04), (-0.2, 0.06, 1e-3, 1e-3)])
 def test_each_pixel_before_the_fold_has_its_ray(distortion):
     lens = replace(PLAIN, fx=300.0, fy=300.0, distortion=distortion)
