@@ -175,7 +175,11 @@ def _in_order_of_time(fit: Fit) -> Fit:
     # All terms are alike in that they leave the bulk elastic.
     material = replace(fit.material, prony=replace(series, relative_moduli=moduli, times=times))
     return replace(
-        fit, material=material, constants=sorted_terms(fit.constants), deviations=sorted_terms(fit.deviations)
+        fit,
+        material=material,
+        constants=sorted_terms(fit.constants),
+        deviations=sorted_terms(fit.deviations),
+        halves=sorted_terms(fit.halves),
     )
 
 
