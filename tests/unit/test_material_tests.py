@@ -226,8 +226,10 @@ def test_intervals_of_few_points_hold(points):
         c10 = float(shape @ stress / (shape @ shape))
         left = stress - c10 * shape
         correlation = min(max(left[1:] @ left[:-1] / (left @ left), 0.0), 0.95) if points > 2 else 0.0
-        fewer = (1.0 + correlation) / (1.0 - correlation)  # neighbours that err alike
-        expected.append(student.ppf(0.975, points - 1) * np.sqrt(fewer * left @ left / (points - 1) / (shape @ shape)))
+        # Neighbours that err alike are fewer points, and show less of their scatter.
+        fewer = (1.0 + correlation) / (1.0 - correlation)
+        freedom = (points - 1) * (1.0 - correlation**2) / (1.0 + correlation**2)
+        expected.append(student.ppf(0.975, freedom) * np.sqrt(fewer * left @ left / (points - 1) / (shape @ shape)))
         found.append((fit.constants["c10"] - c10, fit.halves["c10"]))
     np.testing.assert_allclose(np.array(found)[:, 0], 0.0, atol=1e-5 * MPA)
     np.testing.assert_allclose(np.array(found)[:, 1], expected, rtol=1e-3)

@@ -94,7 +94,7 @@ def fit_law(
 
     Every test counts alike: its differences are divided by its root mean square stress and by the root of its
     number of points. Standard deviations take the scatter from the differences that are left, and count points whose
-    differences have one sign for longer as fewer (`_effective_share`). With as many points as
+    differences have one sign for longer as fewer (`_effective_shares`). With as many points as
     constants nothing is left.
 
     Parameters
@@ -269,24 +269,27 @@ def _covariances(jacobian: Array, differences: Array, sizes: Sequence[int]) -> t
     scaled = jacobian / scale
     inverse = np.linalg.inv(scaled.T @ scaled)
     parts = np.zeros((len(sizes), k, k))
-    for part, rows, own in zip(parts, tests, freedom, strict=True):
+    for number, rows in enumerate(tests):
         left = differences[rows][telling[rows]]
-        variance = left @ left / own / _effective_share(left)
-        part[:] = variance * inverse @ (scaled[rows].T @ scaled[rows]) @ inverse / np.outer(scale, scale)
+        of_means, of_scatter = _effective_shares(left)
+        variance = left @ left / freedom[number] / of_means
+        parts[number] = variance * inverse @ (scaled[rows].T @ scaled[rows]) @ inverse / np.outer(scale, scale)
+        freedom[number] *= of_scatter
     return parts, freedom
 
 
-def _effective_share(left: Array) -> float:
-    """The share of points that count as independent, from the correlation r of neighbours: (1 - r) / (1 + r).
+def _effective_shares(left: Array) -> tuple[float, float]:
+    """The shares of points that count as independent: for what is fitted to them, and for their scatter.
 
-    A law that does not fit leaves a smooth curve, whose points are no independent draws (Bayley and Hammersley,
-    Supplement to the J. R. Stat. Soc. 8, 1946).
+    A law that does not fit leaves a smooth curve, whose points are no independent draws. With the correlation r of
+    neighbours the shares are (1 - r) / (1 + r) and (1 - r^2) / (1 + r^2) (Bayley and Hammersley, Supplement to the
+    J. R. Stat. Soc. 8, 1946).
     """
     energy = float(left @ left)
     if energy == 0.0 or len(left) < 3:
-        return 1.0
-    correlation = min(max(float(left[1:] @ left[:-1]) / energy, 0.0), _MOST_CORRELATED)
-    return (1.0 - correlation) / (1.0 + correlation)
+        return 1.0, 1.0
+    r = min(max(float(left[1:] @ left[:-1]) / energy, 0.0), _MOST_CORRELATED)
+    return (1.0 - r) / (1.0 + r), (1.0 - r * r) / (1.0 + r * r)
 
 
 def assembled(law: Callable[..., Material], values: Mapping[str, Any], n_terms: int) -> Material:
