@@ -1,8 +1,11 @@
 """Registration by landmarks: exact recovery, every way in which it can be wrong, and the files of landmarks."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFailure
@@ -20,6 +23,7 @@ from morph_dslam.registration.messages import (
 )
 from morph_dslam.registration.registration import load_registration
 from morph_dslam.registration.starts import shape_starts, solve_pnp
+from morph_dslam.studies.rigid import build_rigid
 from morph_dslam.tracking.estimator import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
@@ -286,6 +290,54 @@ def test_landmarks_close_to_a_line_have_the_deviation_of_the_turn_about_it(seed)
     deviation = np.sqrt(line @ found.covariance[d : d + 3, d : d + 3] @ line)
     assert abs(turn) < 4.0 * deviation
     assert np.deg2rad(1.0) < deviation < np.deg2rad(10.0)
+
+
+def strip_at_rest(width_m, seed):
+    """A strip of 420 mm at rest, half tilted about its length: the error of that turn and its deviation, rad."""
+    size = np.ptp(MODEL.nodes[:, 1])
+    strip = replace(MODEL, nodes=MODEL.nodes * [1.0, width_m / size, 1.0])
+    on_edges = np.flatnonzero(np.abs(MODEL.nodes[:, 1]) > 0.49 * size)[::3]
+    camera = Camera(1920, 1080, 2100.0, 2100.0, 959.5, 539.5)
+    turned = rotation_exp(np.array([0.6, 0.25, 0.05])) @ np.diag([1.0, -1.0, -1.0])
+    pose = RigidTransform(turned, np.array([0.0, 0.0, 0.62]))
+    pixels = camera.project(pose.apply(strip.nodes[on_edges]))
+    pixels += 0.5 * np.random.default_rng(seed).standard_normal(pixels.shape)
+    found = register_landmarks(strip, camera, Landmarks(strip.nodes[on_edges], pixels), at_rest=True)
+    line, of_rotation = turned[:, 0], slice(len(MODEL.parameters), len(MODEL.parameters) + 3)
+    turn = rotation_log(found.state.camera_from_object.rotation @ turned.T) @ line
+    return turn, np.sqrt(line @ found.covariance[of_rotation, of_rotation] @ line)
+
+
+def test_landmarks_on_both_edges_of_a_slender_object_tell_its_turn_as_exactly_as_stated():
+    """13 px wide in the image: 15 landmarks, 6.3 px beside the middle, of which the sine of the tilt shows the turn."""
+    turns, deviations = np.array([strip_at_rest(3.7e-3, seed) for seed in range(12)]).T
+    expected = 0.5 / (6.3 * np.sqrt(15) * np.sin(0.6))
+    assert np.median(deviations) == pytest.approx(expected, rel=0.3)
+    assert 0.5 < np.sqrt(np.mean((turns / deviations) ** 2)) < 1.5
+
+
+def test_a_narrower_one_that_is_found_in_its_mirrored_tilt_has_a_deviation_that_holds_that():
+    """4 px wide: from the other side of the camera's direction, turned by 1.2, it looks the same in these clicks."""
+    turn, deviation = strip_at_rest(1.2e-3, seed=17)
+    assert abs(turn) > 1.0
+    assert deviation > 0.5
+
+
+def test_an_object_so_narrow_that_clicks_do_not_tell_its_turn_is_refused():
+    with pytest.raises(RegistrationError, match="on one line"):
+        strip_at_rest(0.4e-3, seed=0)
+
+
+def test_landmarks_on_one_edge_of_a_rigid_object_are_refused(tmp_path):
+    trimesh.creation.box(extents=(60.0, 40.0, 30.0)).export(tmp_path / "box.stl")
+    box = build_rigid(tmp_path / "box.stl", "mm", tmp_path / "box.morph")
+    along = np.array([-30.0, -12.0, 5.0, 20.0, 30.0])
+    edge = 1e-3 * np.column_stack([along, np.full(5, 20.0), np.full(5, 15.0)])
+    with pytest.raises(RegistrationError, match="on one line"):
+        register_landmarks(box, CAMERA, Landmarks(edge, CAMERA.project(POSE.apply(edge))))
+    beside = np.vstack([edge, 1e-3 * np.array([[0.0, -20.0, 15.0]])])
+    found = register_landmarks(box, CAMERA, Landmarks(beside, CAMERA.project(POSE.apply(beside))))
+    np.testing.assert_allclose(found.state.camera_from_object.matrix, POSE.matrix, atol=1e-6)
 
 
 @pytest.mark.parametrize(("count", "enough"), [(4, 6), (5, 6), (6, None), (7, None)])

@@ -23,9 +23,6 @@ Array = NDArray[np.float64]
 FEWEST_FOR_FIT = 4
 #: Shares of the object's size: least extent of the landmarks, and how far one may lie off the undeformed surface.
 SPREAD_SHARE, SURFACE_SHARE = 0.12, 0.01
-#: Landmarks that are no farther beside a line than this share of their extent do not tell the turn about it: at 300 px,
-#: errors of a pixel or two are as large as what they show of it.
-LINE_SHARE = 0.01
 #: The latter of hints about an object whose edges give its place in the end: they need not be exact, but no mistakes.
 HINT_SURFACE_SHARE = 0.05
 #: Landmarks in another unit must be spread over this share of the object: on a point they lie anywhere.
@@ -126,18 +123,6 @@ def check_spread(model: ReducedModel, points: Array) -> None:
         raise RegistrationError(
             f"the landmarks are {1e3 * spread:.3g} mm apart on an object of {1e3 * size:.3g} mm: spread them "
             f"over all that is seen of it{_unit_hint(model, points)}"
-        )
-
-
-def check_beside_line(points: Array) -> None:
-    """Refuse landmarks (k, 3) of a body that does not deform if they are all on one line: it may be turned about it."""
-    away = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(away, full_matrices=False)
-    beside = float(np.linalg.norm(away - np.outer(away @ axes[0], axes[0]), axis=1).max())
-    if beside < LINE_SHARE * extent(points):
-        raise RegistrationError(
-            f"the landmarks are on one line, {1e3 * beside:.2g} mm beside it at most, about which the object may be "
-            "turned by any angle: set some of them beside it"
         )
 
 

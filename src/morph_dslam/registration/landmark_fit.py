@@ -10,20 +10,21 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel, SurfacePoints
-from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks, check_beside_line
+from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks
 from morph_dslam.registration.messages import NotAtRest
 from morph_dslam.registration.other_values import as_set, plausible_minima
-from morph_dslam.registration.outline_snap import distinct_states
+from morph_dslam.registration.outline_snap import DISTINCT_SHARE, distinct_states, shape_distance
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import pose_starts, shape_starts
 from morph_dslam.tracking.covariance import floored_inverse
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, State
-from morph_dslam.tracking.other_tilt import mirrored_tilt
+from morph_dslam.tracking.other_tilt import SAME_MINIMUM, mirrored_tilt
 from morph_dslam.tracking.rig import PointsEstimator, RigCamera
+from morph_dslam.tracking.state import pose_increment
 
 Array = NDArray[np.float64]
 #: Least standard deviation of landmarks' pixels that is believed.
@@ -34,6 +35,11 @@ POOR_FIT, POOR_SHARE = 2.0, 1.0 / 800.0
 #: Largest residual (root mean square) as a share of the image's diagonal, and that of hints about an object whose edges
 #: give its place in the end: they need not be exact, but no mistakes.
 RESIDUAL_SHARE, HINT_RESIDUAL_SHARE = 0.005, 0.02
+#: Landmarks must be beside a line by so many times their error, all together (root of the sum of squares): the turn
+#: about it is then known to a twelfth of a radian, seen edge-on. With less, linear theory does not state its error.
+LEAST_BESIDE = 12.0
+#: Landmarks no farther beside a line than this share of their spread along it have no pose to begin with.
+EXACT_LINE = 1e-4
 #: The mirrored tilts of so many states are tried.
 MOST_TILTS = 8
 
@@ -62,7 +68,25 @@ class LandmarkFit:
     @property
     def covariance(self) -> Array:
         """(d + 6, d + 6); a few landmarks that happen to fit well, or that a wrong model fits, are not exact for it."""
-        return self.best.covariance * as_set(self.best, self.click_px)
+        covariance = self.best.covariance * as_set(self.best, self.click_px)
+        if _is_shape_known(self.estimator):
+            covariance[-6:, -6:] += self._spread_of_turns()
+        return covariance
+
+    def _spread_of_turns(self) -> Array:
+        """What other poses that look the same add to the covariance (6, 6) of the pose of an object at rest.
+
+        They have its surface where the best one has it, as a slender object that is turned about its length.
+        """
+        best, aparts, weights = self.best, [np.zeros(6)], [1.0]
+        variance = max(self.click_px, best.sigma_px) ** 2
+        for other in self.plausible[1:]:
+            apart = pose_increment(best.state.camera_from_object, other.state.camera_from_object)
+            is_new = min(float(np.linalg.norm((apart - one)[:3])) for one in aparts) > SAME_MINIMUM
+            if is_new and shape_distance(self.estimator.model, best.state, other.state) <= DISTINCT_SHARE:
+                aparts.append(apart)
+                weights.append(float(np.exp((best.cost - other.cost) / variance)))
+        return (np.array(aparts).T * np.array(weights) / sum(weights)) @ np.array(aparts)
 
     @property
     def rms_px(self) -> float:
@@ -109,12 +133,14 @@ def fit_landmarks(
     at_rest : whether the parameters are their defaults.
     near : a state close by that alone is started from; None for shapes spread over the parameters' ranges.
 
-    Raises RegistrationError if nothing explains them, or they are on one line of an object at rest.
+    Raises RegistrationError if nothing explains them, or they are on one line of an object of known shape.
     """
     points, pixels = landmarks.points, landmarks.pixels
-    if at_rest:
-        check_beside_line(points.rest)
     estimator = _estimator(model, cameras, landmarks, at_rest)
+    if _is_shape_known(estimator):
+        _, spread, _ = np.linalg.svd(points.rest - points.rest.mean(axis=0))
+        if spread[1] < EXACT_LINE * spread[0]:
+            raise _on_one_line(0.0, click_px)
     shapes = shape_starts(model)
     if at_rest or 2 * len(landmarks) < len(model.parameters) + 6:
         # Too few landmarks leave the shape at its default; the damped iteration departs no more than it must.
@@ -127,7 +153,10 @@ def fit_landmarks(
         found = [_of_pose_alone(estimator, points, pixels, estimate) for estimate in found]
     plausible = plausible_minima(found, click_px, estimator.box.n_unknowns)
     _check_residual(estimator, landmarks, plausible[0])
-    return LandmarkFit(estimator, landmarks, plausible, click_px)
+    fit = LandmarkFit(estimator, landmarks, plausible, click_px)
+    if _is_shape_known(estimator):
+        _check_beside_line(fit)
+    return fit
 
 
 def _with_other_tilts(
@@ -222,7 +251,7 @@ def _check_residual(
         return
     if contradiction := cameras_contradict(estimator, landmarks.points, landmarks.pixels, best, limit, is_far=True):
         raise RegistrationError(str(contradiction), RegistrationFailure.LANDMARKS_DO_NOT_FIT)
-    is_shape_known = np.array_equal(estimator.box.lower, estimator.box.upper)
+    is_shape_known = _is_shape_known(estimator)
     wrong = _contradicted(estimator, landmarks, limit) if is_shape_known else None
     if wrong is not None:
         row, away, agreeing = wrong
@@ -240,6 +269,36 @@ def _check_residual(
         f"{limit:.1f} px), the worst is landmark {landmarks.name(worst)} with {lengths[worst]:.1f} px; check "
         f"its pixel, the order of the landmarks, the camera file, and that {shape}{more}",
         RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+    )
+
+
+def _is_shape_known(estimator: PointsEstimator) -> bool:
+    """Whether the pose alone is unknown."""
+    return np.array_equal(estimator.box.lower, estimator.box.upper)
+
+
+def _check_beside_line(fit: LandmarkFit) -> None:
+    """Refuse landmarks of an object of known shape that are all on one line: it may be turned about it."""
+    points, state = fit.landmarks.points, fit.best.state
+    positions = points.rest + points.field.value(state.parameters)
+    middle = positions.mean(axis=0)
+    axis = np.linalg.svd(positions - middle, full_matrices=False)[2][0]
+    turned = []
+    for quarter in range(4):
+        rotation = rotation_exp(0.5 * np.pi * quarter * axis)
+        pose = state.camera_from_object @ RigidTransform(rotation, middle - rotation @ middle)
+        turned.append(fit.estimator.pixels(points, replace(state, camera_from_object=pose)))
+    # Quarter turns show how far a landmark is beside the line, whichever way it is off it in the image.
+    beside_px = np.sqrt(0.5 * np.sum((turned - np.mean(turned, axis=0)) ** 2, axis=(0, 2)))
+    error_px = max(fit.click_px, fit.best.sigma_px)
+    if np.linalg.norm(beside_px) < LEAST_BESIDE * error_px:
+        raise _on_one_line(float(beside_px.max()), error_px)
+
+
+def _on_one_line(beside_px: float, error_px: float) -> RegistrationError:
+    return RegistrationError(
+        f"the landmarks are on one line, {beside_px:.1f} px beside it at most with errors of {error_px:.1f} px, about "
+        "which the object may be turned by any angle: set some of them farther beside it"
     )
 
 
