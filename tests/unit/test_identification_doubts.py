@@ -238,6 +238,19 @@ def test_points_of_another_frame_are_aligned() -> None:
         replace(table, measured=missing)
 
 
+@pytest.mark.parametrize("shift", [0.0, 2.0])
+def test_another_frame_is_no_change_by_the_load(shift: float) -> None:
+    """Two of four corners move along x; of a body that shrinks, which the model cannot, all is missed, to both sides."""
+    tables = [points([a, a, a], turn=0.3, shift=shift, aligned=True) for a in (0.2, -0.2)]
+    both = [summarise(identify(table.model, [table], ["a"])) for table in tables]
+    (of_right,), (of_wrong,) = (figures["measurements"] for figures in both)
+    moved, left = 1e3 * 0.2 * np.sqrt(2 / 12), 1e3 * 0.1 / np.sqrt(3)
+    assert [of_right["change_rms"], *(s["change_rms"] for s in of_right["states"])] == pytest.approx([moved] * 4)
+    assert (of_wrong["rms"], of_wrong["change_rms"]) == pytest.approx((left, left))
+    said = ["\n".join(identification_lines(figures)) for figures in both]
+    assert ["of it is missed: check the units" in text for text in said] == [False, True]
+
+
 def test_points_that_are_displacements_or_in_other_units_are_doubted() -> None:
     right = points([0.2, 0.2, 0.4])
     as_displacements = replace(right, measured=right.measured - right.places)

@@ -21,7 +21,7 @@ def size_factor(forces: MeasuredForces, predicted: Array) -> float | None:
     size = float(modelled @ modelled)
     if size <= (ROUNDING * float(np.abs(predicted).max())) ** 2 * len(predicted):
         return None
-    return float(modelled @ forces.changes) / size
+    return float(modelled @ forces.changes(predicted)) / size
 
 
 def check_size(forces: MeasuredForces, predicted: Array, moduli: float = 1.0, at_end: bool = False) -> None:

@@ -80,6 +80,11 @@ class Misfit:
         return self.predicted - self.measurement.values
 
     @property
+    def changes(self) -> Array:
+        """By how much the load changed the values (n,)."""
+        return self.measurement.changes(self.predicted - self.adjustment)
+
+    @property
     def rms(self) -> float:
         """Root mean square of what it is missed by."""
         return root_mean_square(self.missed)

@@ -224,7 +224,7 @@ class _Fit:
         k = len(self._unknowns)
         starts = 0.05 + 0.9 * qmc.Sobol(k, scramble=False).random(STARTS)
         middle = np.full(k, 0.5)
-        self._noise = np.maximum(self._changes(), self._least())
+        self._noise = np.maximum(self._changes(middle), self._least())
         ends = [self._solved(start) for start in (middle, *starts)]
         # Of ends that fit alike, as all along a valley, the first: rounding must not choose.
         most = (1.0 + ALIKE) * min(cost for cost, _ in ends)
@@ -271,12 +271,13 @@ class _Fit:
             for each, (raw, _) in pairs
         ]
 
-    def _changes(self) -> Array:
+    def _changes(self, theta: Array) -> Array:
         """By how much the load changed the values of each measurement, (m,); those of one unit are alike."""
-        units = [each.unit for each in self._measurements]
-        changes = {
-            unit: np.concatenate([each.changes for each in self._measurements if each.unit == unit]) for unit in units
-        }
+        units, values = [each.unit for each in self._measurements], self._values(theta)
+        changes: dict[str, Array] = {}
+        for unit, each in zip(units, self._measurements, strict=True):
+            own = each.changes(each.predict(values))
+            changes[unit] = np.concatenate([changes.get(unit, own[:0]), own])
         return np.array([root_mean_square(changes[unit]) for unit in units])
 
     def _least(self) -> Array:
@@ -287,8 +288,8 @@ class _Fit:
         """The noise that residuals show; ``by_curve`` within curves that have a factor each."""
         units, missed, design = [each.unit for each in self._measurements], self._missed(theta), self._design(theta)
         if by_curve:
-            return noise_within(design, missed, self._ways(theta), units, self._changes(), self._noise)
-        return Noise.shown(design, missed, units, self._changes())
+            return noise_within(design, missed, self._ways(theta), units, self._changes(theta), self._noise)
+        return Noise.shown(design, missed, units, self._changes(theta))
 
     def _design(self, theta: Array) -> Design:
         pairs = zip(self._predictions(theta), self._measurements, strict=True)

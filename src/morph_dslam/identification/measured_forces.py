@@ -161,8 +161,7 @@ class MeasuredForces:
         along = np.array([self.reaction(self.model.vector(known)) for known in self._known])
         return self.reaction.following(along, self.values)
 
-    @property
-    def changes(self) -> Array:
+    def changes(self, predicted: Array) -> Array:
         return self.values - self.values.mean() if self.free_zero else self.values
 
     @property

@@ -103,9 +103,9 @@ class MeasuredPoints:
             )
         return self.model.triangles[points.triangles], points.weights
 
-    @property
-    def changes(self) -> Array:
-        return (self.measured - self.places)[self._present]
+    def changes(self, predicted: Array) -> Array:
+        measured = self._motion(predicted).inverse.apply(self.measured) if self.aligned else self.measured
+        return (measured - self.places)[self._present]
 
     @property
     def span(self) -> float | None:

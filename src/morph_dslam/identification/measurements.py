@@ -68,9 +68,11 @@ class Measurement(Protocol):
         """(n,) labels of values whose errors may belong together."""
         ...
 
-    @property
-    def changes(self) -> Array:
-        """By how much the load changed the values (n,), SI."""
+    def changes(self, predicted: Array) -> Array:
+        """By how much the load changed the values (n,), SI.
+
+        Those in another frame need the predictions (n,), without what is not known of the measurement itself.
+        """
         ...
 
     @property

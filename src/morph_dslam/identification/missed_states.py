@@ -33,7 +33,7 @@ def state_figures(misfit: Misfit, points: MeasuredPoints) -> list[dict[str, Any]
     misfit : of the points.
     points : as measured.
     """
-    of_value, of_row, changes = np.array(points.value_states), np.array(points.states), points.changes
+    of_value, of_row, changes = np.array(points.value_states), np.array(points.states), misfit.changes
     parameters = {p.name: p for p in points.model.parameters}
     found = []
     for name in dict.fromkeys(points.value_states):

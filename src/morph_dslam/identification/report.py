@@ -84,7 +84,7 @@ def _misfit_figures(misfit: Misfit, found: Identification) -> dict[str, Any]:
         "groups": len(np.unique(measurement.groups)),
         "rms": scale * misfit.rms,
         "largest": scale * float(np.abs(misfit.missed).max()),
-        "change_rms": scale * root_mean_square(measurement.changes),
+        "change_rms": scale * root_mean_square(misfit.changes),
         "model_error_rms": scale * misfit.model_rms,
         "run_error_rms": scale * misfit.run_rms,
         "change_over_range_rms": dict(zip(identified, (scale * misfit.by_range).tolist(), strict=True)),
