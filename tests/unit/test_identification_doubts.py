@@ -240,7 +240,7 @@ def test_points_of_another_frame_are_aligned() -> None:
 
 @pytest.mark.parametrize("shift", [0.0, 2.0])
 def test_another_frame_is_no_change_by_the_load(shift: float) -> None:
-    """Two of four corners move along x; of a body that shrinks, which the model cannot, all is missed, to both sides."""
+    """Two of four corners move along x; of one that shrinks, which the model cannot, all is missed, to both sides."""
     tables = [points([a, a, a], turn=0.3, shift=shift, aligned=True) for a in (0.2, -0.2)]
     both = [summarise(identify(table.model, [table], ["a"])) for table in tables]
     (of_right,), (of_wrong,) = (figures["measurements"] for figures in both)

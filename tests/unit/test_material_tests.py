@@ -24,6 +24,7 @@ from morph_dslam.extend.material_tests import (
     recommended,
     write_fit,
 )
+from morph_dslam.material_tests.candidates import Span
 from morph_dslam.material_tests.stability import first_unstable_stretches
 from morph_dslam.mechanics.materials.isotropic import ArrudaBoyce, Gent, MooneyRivlin, Ogden, Yeoh
 from morph_dslam.mechanics.materials.library import material_from_table
@@ -391,6 +392,25 @@ def test_tables_that_cannot_be_are_refused(tmp_path, text, says):
 def test_compression_given_as_positive_is_named():
     with pytest.raises(IdentificationError, match="stresses in compression have the wrong sign"):
         fit_candidate("yeoh", [made("uniaxial", [0.9, 0.8, 0.7, 0.6], [0.1e6, 0.2e6, 0.3e6, 0.4e6])])
+
+
+def test_errors_about_a_stretch_of_one_have_no_wrong_sign():
+    """Of an extensometer with 0.02 % and a load cell with 0.1 % of the largest force, that rest before the test."""
+    true = np.r_[np.ones(20), np.linspace(1.0, 2.0, 101)]
+    stress = 0.4e6 * (true - true**-2)
+    for draw in range(100):
+        rng = np.random.default_rng(draw)
+        stretch = true + 2e-4 * rng.normal(size=len(true))
+        measured = stress + 1e-3 * stress.max() * rng.normal(size=len(true))
+        assert Span.of([made("uniaxial", stretch, measured)]).shear == pytest.approx(0.4e6, rel=2e-3)
+
+
+@pytest.mark.parametrize(("least", "word"), [(0.9, "compression"), (1.0, "tension")])
+def test_a_part_of_a_test_with_the_wrong_sign_is_refused(least, word):
+    stretch = np.linspace(least, 1.5, 40)
+    stress = 0.4e6 * (stretch - stretch**-2)
+    with pytest.raises(IdentificationError, match=f"stresses in {word} have the wrong sign"):
+        Span.of([made("uniaxial", stretch, np.abs(stress) if word == "compression" else -stress)])
 
 
 # The command.

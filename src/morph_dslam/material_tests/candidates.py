@@ -34,6 +34,9 @@ _FACTOR = 50.0
 _POSITIVE, _NEGATIVE = (0.2, 15.0), (-6.0, -0.2)
 #: Tests with stretches below this say something of compression.
 _COMPRESSED = 0.95
+#: Stresses whose product with those of a neo-Hookean solid is so far below zero, over both sizes, have the wrong sign.
+#: About a stretch of 1 both have errors of measurement, whose products are small and of either sign.
+_OPPOSED = 0.01
 #: By this factor the range of a relaxation time reaches into its neighbours'.
 _OVERLAP = 5.0
 #: The bulk modulus over the shear modulus of what is written: such tests do not measure it.
@@ -221,8 +224,9 @@ def neo_hookean_shear(tests: Sequence[MaterialTest]) -> float:
     top = bottom = 0.0
     for test in tests:
         shape = neo_hookean_shape(test)
+        both = float(np.linalg.norm(shape) * np.linalg.norm(test.stress))
         for side, word in ((shape > 0.0, "tension"), (shape < 0.0, "compression")):
-            if float(shape[side] @ test.stress[side]) < 0.0:
+            if float(shape[side] @ test.stress[side]) < -_OPPOSED * both:
                 raise IdentificationError(
                     f"{test.name}: stresses in {word} have the wrong sign; tension is positive, compression negative"
                 )
