@@ -184,6 +184,24 @@ def test_an_error_of_the_shape_is_one_of_the_parameters_that_are_not_known() -> 
     assert found["a"].std == pytest.approx(found["a"].model_std, rel=1e-2)
 
 
+def test_a_table_is_right_about_what_it_gives() -> None:
+    """One has b, of another it is unknown: a is that of both, b that of the other, by 1 m and 0.5 m for each unit.
+
+    The model's error of the first is one of a alone, as above, for b is held there.
+    """
+    errors, products = {"a": [0.02], "b": [0.1], "c": [0.0]}, [[[0.25, 0.05, 0.0], [0.05, 0.02, 0.0], [0.0, 0.0, 0.0]]]
+    entry = {"errors": errors, "displacement_rms_mm": [500.0], "left_rms_mm": [0.0], "products_m2": products}
+    model = stating({"discretisation": {"parameters": entry}})
+    given, other = points_at([0.3] * 4, 0.0, {"b": np.full(16, 0.5)}), points_at([0.3] * 4, 0.0, {"c": np.ones(16)})
+    other.measured[:, 1] = other.places[:, 1] + 0.5 * 0.2
+    tables = [replace(given, model=model), replace(other, model=model, name="other")]
+    found = identify(model, tables, ["a", "b"])
+    assert (found["a"].value, found["b"].value) == pytest.approx((0.3, 0.2), abs=1e-6)
+    assert found.misfits[0].model_rms == pytest.approx(0.5 * 0.04 * np.hypot(0.3, 0.25) / 0.5, rel=1e-3)
+    with pytest.raises(IdentificationError, match="what points has of it is taken as known"):
+        identify(model, tables[:1], ["a", "b"])
+
+
 def test_forces_by_frame_name_the_loading_rate() -> None:
     """One parameter rises by 0.02 a frame, one frame is lost, the others stay."""
     model, frames = plate(), np.arange(10, 40)

@@ -310,8 +310,10 @@ class _Fit:
         jacobian, by_model, by_run = self._jacobian(theta), self._model_errors(theta), self._state_errors(theta)
         silent = [p.name for p, column in zip(self._unknowns, jacobian.T, strict=True) if not column.any()]
         if silent:
+            given = " and ".join(m.name for m in self._measurements if m.run is None and silent[0] in m.given)
             raise IdentificationError(
                 f"nothing that was measured depends on '{silent[0]}': leave it out, or measure something that does"
+                + (f"; what {given} has of it is taken as known" if given else "")
             )
         residuals = self._residuals(theta)
         spread = self._spread(theta, residuals, by_model, by_run)

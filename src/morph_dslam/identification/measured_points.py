@@ -141,7 +141,7 @@ class MeasuredPoints:
         return np.vstack([np.tile(np.eye(3), (1, len(points))), turns]).T
 
     def model_errors(self, unknowns: Unknowns) -> Array:
-        return shape_errors(self.model, self.positions, unknowns.vector, unknowns.free)[:, self._present]
+        return shape_errors(self.model, self.positions, unknowns.vector, unknowns.free(self.given))[:, self._present]
 
     def state_errors(self, unknowns: Unknowns) -> Array:
         """None: states are as the table gives them."""

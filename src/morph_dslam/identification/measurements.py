@@ -7,7 +7,7 @@ or along a stretch of a force curve, are not independent of each other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -24,15 +24,17 @@ class Unknowns(Protocol):
 
     factor: float
     """Common factor of all moduli."""
-    free: frozenset[str]
-    """Names of the model's parameters that they change."""
 
     def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
-        """The model's parameters (d,), SI, where those that are not identified are known.
+        """The model's parameters (d,), SI, where these are known; what is ``shown`` is so but for what is identified.
 
         Loads that are ``known`` are divided by the factor of the moduli (`given_loads`), but for those that were
         ``shown`` by pictures: with them the model, whose moduli they do not have, has the shape that was seen.
         """
+        ...
+
+    def free(self, given: Collection[str]) -> frozenset[str]:
+        """Names of the model's parameters that they change where these are given."""
         ...
 
 

@@ -25,7 +25,6 @@ class Values:
 
     Attributes
     ----------
-    free : names of the model's parameters that the unknowns change.
     beyond : values, SI, of parameters that such a division has taken out of their ranges, by name.
     """
 
@@ -34,12 +33,13 @@ class Values:
     ) -> None:
         self._model, self._scaled = model, scaled
         self._own = {p.name: float(value) for p, value in zip(unknowns, theta, strict=True)}
-        self.free = frozenset(self._own).difference([FACTOR]) | frozenset(scaled if FACTOR in self._own else ())
+        self._divided = frozenset(scaled if FACTOR in self._own else ())
         self.factor = self._own.pop(FACTOR, 1.0)
         self.beyond: dict[str, list[float]] = {}
 
     def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
-        mu = self._model.vector({**known, **self._own})
+        # A table is right about what it gives; a run saw shapes, of which what is identified is a part.
+        mu = self._model.vector({**known, **self._own} if shown else {**self._own, **known})
         for k, parameter in enumerate(self._model.parameters):
             name = parameter.name
             if name in self._scaled and not (shown and name in known and name not in self._own):
@@ -47,6 +47,9 @@ class Values:
                 if not parameter.in_range(mu[k]):
                     self.beyond.setdefault(name, []).append(float(mu[k]))
         return mu
+
+    def free(self, given: Collection[str]) -> frozenset[str]:
+        return frozenset(self._own).difference(given) | self._divided
 
     def shown(self, names: Sequence[str]) -> Array:
         """Those unknowns (m,) as pictures show them, in which loads are those of the model."""
