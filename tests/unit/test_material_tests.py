@@ -20,6 +20,7 @@ from morph_dslam.extend.material_tests import (
     NominalStress,
     fit_candidate,
     fit_law,
+    fit_lines,
     load_test,
     recommended,
     write_fit,
@@ -160,6 +161,21 @@ def test_a_series_is_found_from_ramps_and_relaxation():
     assert found.fit.material.prony.relative_moduli == pytest.approx((0.4, 0.3), rel=1e-3)
     assert found.fit.material.prony.times == pytest.approx((0.8, 15.0), rel=1e-3)
     assert max(found.fit.errors) < 1e-5
+
+
+def test_a_test_without_times_has_relaxed(tmp_path):
+    """Of a series that leaves 0.3 of the stress, beside a ramp that is held; no kind but the bar's is tested."""
+    time = np.r_[np.linspace(0.0, 2.0, 25), 2.0 + np.geomspace(0.1, 60.0, 25)]
+    held = ramp_and_hold(time, 2.0, 1.8, (0.4, 0.3), (0.8, 15.0))
+    ramp = MaterialTest("ramp", np.minimum(1.0 + 0.8 * time / 2.0, 1.8), held, time)
+    stretch = np.linspace(1.02, 1.6, 20)
+    slow = MaterialTest("slow", stretch, 0.3 * 1e5 * (stretch - stretch**-2))
+    found = fit_candidate("neo_hookean", [ramp, slow], n_terms=2)
+    assert found.fit.constants["c10"] == pytest.approx(0.5e5, rel=1e-3)
+    assert found.fit.material.prony.relative_moduli == pytest.approx((0.4, 0.3), rel=1e-2)
+    assert max(found.fit.errors) < 1e-3
+    said = fit_lines(write_fit(tmp_path, [found], [ramp, slow], "rubber"))
+    assert any("slow has no times" in line for line in said)
 
 
 def test_terms_of_a_series_are_in_the_order_of_their_times():

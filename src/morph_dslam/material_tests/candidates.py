@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -279,7 +279,8 @@ def _alike(fitted: Sequence[FittedLaw], factor: float) -> list[FittedLaw]:
 def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> dict[str, float]:
     """Kind of test that was not made -> by how much laws that fit about as well differ there, over their mean.
 
-    It is the largest difference of their nominal stress at stretches up to the largest first invariant of the tests.
+    It is the largest difference of their nominal stress at stretches up to the largest first invariant of the tests,
+    with a Prony series of the instantaneous one: how much relaxes is no question of the kind of test.
     """
     most = largest_invariant(tests)
     made = {test.kind for test in tests}
@@ -289,6 +290,7 @@ def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) 
             continue
         stretch = stretches_up_to(kind, most)
         test = MaterialTest(kind, stretch, np.ones(len(stretch)), kind=kind)
-        stresses = np.array([NominalStress(each.fit.material, test)() for each in _alike(fitted, _COMPARED)])
+        laws = [replace(each.fit.material, prony=None) for each in _alike(fitted, _COMPARED)]
+        stresses = np.array([NominalStress(law, test)() for law in laws])
         spread[kind] = float(np.max(np.ptp(stresses, axis=0) / np.abs(stresses.mean(axis=0))))
     return spread

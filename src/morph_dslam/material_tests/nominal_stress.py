@@ -4,7 +4,8 @@ The solid is taken as incompressible, as rubber, silicone and gels nearly are. A
 powers of l whatever the law, and the pressure is eliminated by the direction that is free of stress: with S1 and S3 the
 second Piola-Kirchhoff stress of the law's remainder along the pull and along the free direction, the nominal stress
 is P = l S1 - S3 l3^2 / l (Holzapfel, Nonlinear Solid Mechanics, 2000, section 6.5). With a Prony series S1 and S3 are
-convolved with the relaxation. The stretch goes straight from row to row of a test, however far apart they are.
+convolved with the relaxation; a test without times is so slow that all has relaxed. The stretch goes straight from row
+to row of a test, however far apart they are.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class MaterialTest:
     stretch : (n,) deformed over undeformed length.
     stress : (n,) nominal stress, force over undeformed section, Pa.
     time : (n,) s, increasing; the specimen has rested before the first, and its stretch changes evenly from one to the
-        next. None: so slow that time is no matter.
+        next. None: so slow that a material with a Prony series has relaxed in each row.
     kind : "uniaxial" (tension or compression of a bar), "biaxial" (equal in two directions), or "planar" (tension of
         a wide strip that keeps its width, also called pure shear).
 
@@ -137,12 +138,15 @@ class NominalStress:
         """(n,) nominal stress, Pa."""
         stress = np.asarray(self._components(self._points))
         prony = self.material.prony
-        if prony is not None and self._time is not None:
+        if prony is not None:
             moduli, times = (
                 np.array([ngs.CF(value)(self._points)[0, 0] for value in values])
                 for values in (prony.relative_moduli, prony.times)
             )
-            stress = relaxed_stress(stress, self._time, moduli, times)[self._rows]
+            if self._time is None:
+                stress = (1.0 - moduli.sum()) * stress
+            else:
+                stress = relaxed_stress(stress, self._time, moduli, times)[self._rows]
         return self.stretch * stress[:, 0] - stress[:, 1] * self._free**2 / self.stretch
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +162,11 @@ def fit_lines(figures: Mapping[str, Any]) -> list[str]:
     if returning := [test["name"] for test in figures["tests"] if elastic and test["returns"]]:
         advice = "give its first loading alone, or a Prony series (--prony) to a test with times"
         said.append(f"note: {', '.join(returning)} unloads; an elastic law takes the mean of both ways: {advice}")
+    if slow := [test["name"] for test in figures["tests"] if not (elastic or test["times"])]:
+        said.append(
+            f"note: {', '.join(slow)} {'has' if len(slow) == 1 else 'have'} no times: taken as so slow that all has "
+            "relaxed; a column such as time_s tells how fast"
+        )
     wide = {kind: spread for kind, spread in figures["spread_where_not_tested"].items() if spread > _WIDE}
     if wide:
         listed = ", ".join(f"{kind}: {100.0 * spread:.0f} %" for kind, spread in wide.items())
@@ -215,6 +221,7 @@ def _draw(path: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     best = recommended(fitted, tests)
     most = largest_invariant(tests)
+    at_once = "" if best.fit.material.prony is None else ", instantaneous"
     for place, kind in enumerate(KINDS, start=1):
         axes = figure.add_subplot(1, len(KINDS), place)
         made = [test for test in tests if test.kind == kind]
@@ -222,7 +229,7 @@ def _draw(path: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]
             _draw_in_time(axes, best, tests, kind)
         else:
             _draw_over_stretch(axes, fitted, best, made, kind, most)
-        axes.set_title(f"{kind} tension" if made else f"{kind} tension, not tested: predicted")
+        axes.set_title(f"{kind} tension" if made else f"{kind} tension, not tested: predicted{at_once}")
         axes.set_ylabel("nominal stress, MPa")
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=DPI)
@@ -238,7 +245,9 @@ def _draw_over_stretch(
         axes.plot(test.stretch, test.stress / _MEGAPASCAL, ".", color="0.3", label=test.name)
     shown = np.zeros(1)
     for each in fitted:
-        curve = NominalStress(each.fit.material, MaterialTest(kind, stretch, np.ones(len(stretch)), kind=kind))()
+        # Where nothing was measured, what laws are compared by; slow tests have relaxed.
+        law = each.fit.material if made else replace(each.fit.material, prony=None)
+        curve = NominalStress(law, MaterialTest(kind, stretch, np.ones(len(stretch)), kind=kind))()
         width = 2.6 if each is best else 1.0
         axes.plot(stretch, curve / _MEGAPASCAL, lw=width, zorder=3 if each is best else 2, label=each.name)
         if each is best:
