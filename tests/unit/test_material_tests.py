@@ -26,6 +26,7 @@ from morph_dslam.extend.material_tests import (
     write_fit,
 )
 from morph_dslam.material_tests.candidates import Span
+from morph_dslam.material_tests.report import summarise
 from morph_dslam.material_tests.stability import first_unstable_stretches
 from morph_dslam.mechanics.materials.isotropic import ArrudaBoyce, Gent, MooneyRivlin, Ogden, Yeoh
 from morph_dslam.mechanics.materials.library import material_from_table
@@ -474,6 +475,27 @@ def test_what_was_not_tested_and_what_unloads_is_said(tmp_path, capsys):
     assert "biaxial" in printed
     assert main(["fit", argument, "--prony", "2", "-o", str(tmp_path / "series")]) == 2
     assert "needs tests with times" in capsys.readouterr().err
+
+
+UP, DOWN = np.linspace(1.0, 1.5, 20), np.linspace(1.0, 0.5, 20)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "returns"),
+    [
+        (np.linspace(0.5, 1.3, 40), False),
+        (np.linspace(1.3, 0.6, 40), False),
+        (np.linspace(0.5, 1.3, 40) + 1e-3 * np.cos(np.arange(40.0) ** 2), False),
+        (np.r_[DOWN[1:], UP], False),
+        (np.r_[UP, UP[::-1]], True),
+        (np.r_[DOWN, DOWN[::-1]], True),
+        (np.r_[UP, UP[:9:-1]], True),
+        (np.r_[UP, UP[::-1], DOWN], True),
+    ],
+)
+def test_only_what_goes_both_ways_unloads(stretch, returns):
+    test = made("uniaxial", stretch, 0.4e6 * (stretch - stretch**-2))
+    assert summarise([fit_candidate("neo_hookean", [test])], [test])["tests"][0]["returns"] is returns
 
 
 def test_nothing_to_fit_is_refused(tmp_path, capsys):

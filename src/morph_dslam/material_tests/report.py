@@ -89,10 +89,18 @@ def _test_figures(test: MaterialTest) -> dict[str, Any]:
 
 
 def _returned(stretch: Array) -> float:
-    """How far a test goes back from its largest strain, over that strain."""
-    strain = np.abs(stretch - 1.0)
-    peak = int(np.argmax(strain))
-    return float((strain[peak] - strain[peak:].min()) / strain[peak])
+    """How far a test goes both up and down in tension, or in compression, over its largest strain.
+
+    A table may begin with the most compressed row, or at any other end: only what goes both ways has gone back. Rows at
+    rest may be where another specimen begins.
+    """
+    strain = stretch - 1.0
+    back = [0.0]
+    for side in (strain[strain > 0.0], -strain[strain < 0.0]):
+        if len(side):
+            up, down = side - np.minimum.accumulate(side), np.maximum.accumulate(side) - side
+            back.append(min(float(up.max()), float(down.max())))
+    return max(back) / float(np.abs(strain).max())
 
 
 def _law_figures(each: FittedLaw) -> dict[str, Any]:
