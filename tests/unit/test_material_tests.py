@@ -498,6 +498,11 @@ def test_only_what_goes_both_ways_unloads(stretch, returns):
     assert summarise([fit_candidate("neo_hookean", [test])], [test])["tests"][0]["returns"] is returns
 
 
+def test_one_row_with_a_time_tells_no_relaxation():
+    with pytest.raises(IdentificationError, match="needs tests with times, in two rows at least"):
+        fit_candidate("neo_hookean", [made("uniaxial", [1.5], [0.4e6], np.zeros(1))], n_terms=1)
+
+
 def test_nothing_to_fit_is_refused(tmp_path, capsys):
     assert main(["fit", "-o", str(tmp_path)]) == 2
     assert "give at least one test" in capsys.readouterr().err

@@ -246,9 +246,11 @@ def neo_hookean_shape(test: MaterialTest) -> Array:
 
 def _series_bounds(tests: Sequence[MaterialTest], n_terms: int) -> tuple[list[Bounds], list[Bounds]]:
     """Bounds of shares and times of a Prony series: a range of times for each term, as far as tests tell."""
-    timed = [test.time for test in tests if test.time is not None]
+    timed = [test.time for test in tests if test.time is not None and len(test.time) > 1]
     if not timed:
-        raise IdentificationError("a Prony series needs tests with times; give a column such as time_s")
+        raise IdentificationError(
+            "a Prony series needs tests with times, in two rows at least; give a column such as time_s"
+        )
     # A process faster than most intervals of the quickest test does not show.
     shortest = min(float(np.median(np.diff(time))) for time in timed)
     longest = max(float(time[-1] - time[0]) for time in timed)
