@@ -25,7 +25,7 @@ from morph_dslam.extend.material_tests import (
     recommended,
     write_fit,
 )
-from morph_dslam.material_tests.candidates import Span
+from morph_dslam.material_tests.candidates import Span, untested_spread
 from morph_dslam.material_tests.report import summarise
 from morph_dslam.material_tests.stability import first_unstable_stretches
 from morph_dslam.mechanics.materials.isotropic import ArrudaBoyce, Gent, MooneyRivlin, Ogden, Yeoh
@@ -496,6 +496,22 @@ UP, DOWN = np.linspace(1.0, 1.5, 20), np.linspace(1.0, 0.5, 20)
 def test_only_what_goes_both_ways_unloads(stretch, returns):
     test = made("uniaxial", stretch, 0.4e6 * (stretch - stretch**-2))
     assert summarise([fit_candidate("neo_hookean", [test])], [test])["tests"][0]["returns"] is returns
+
+
+def test_compression_of_a_bar_is_biaxial_tension_and_tells_little_of_its_own():
+    """Pulled, Mooney-Rivlin has P = 2 (l - 1 / l^2) (c10 + c01 / l), and Yeoh the slope of his energy; I1 is 4.25."""
+    stretch = np.linspace(1.0, 0.5, 30)
+    test = made("uniaxial", stretch, 2 * (stretch - stretch**-2) * (2e5 + 5e4 / stretch))
+    laws = [fit_candidate(name, [test]) for name in ("mooney_rivlin", "yeoh")]
+    assert laws[1].fit.error < 0.01
+    spread = untested_spread(laws, [test])
+    assert set(spread) == {"uniaxial", "planar"}
+    c10, c20, c30 = (laws[1].fit.constants[name] for name in ("c10", "c20", "c30"))
+    pulled = np.linspace(1.05, max(np.roots([1.0, 0.0, -4.25, 2.0]).real), 200)
+    left = pulled**2 + 2 / pulled - 3
+    by_yeoh, by_mooney = c10 + 2 * c20 * left + 3 * c30 * left**2, 2e5 + 5e4 / pulled
+    expected = np.max(np.abs(by_yeoh - by_mooney) / (0.5 * np.abs(by_yeoh + by_mooney)))
+    assert spread["uniaxial"] == pytest.approx(expected, rel=0.01)
 
 
 def test_one_row_with_a_time_tells_no_relaxation():

@@ -37,6 +37,8 @@ _COMPRESSED = 0.95
 #: Stresses whose product with those of a neo-Hookean solid is so far below zero, over both sizes, have the wrong sign.
 #: About a stretch of 1 both have errors of measurement, whose products are small and of either sign.
 _OPPOSED = 0.01
+#: A test that pulls by less than this part of what it presses is one of compression, whose rows at rest have errors.
+_RESTING = 0.1
 #: By this factor the range of a relaxation time reaches into its neighbours'.
 _OVERLAP = 5.0
 #: The bulk modulus over the shear modulus of what is written: such tests do not measure it.
@@ -279,13 +281,13 @@ def _alike(fitted: Sequence[FittedLaw], factor: float) -> list[FittedLaw]:
 
 
 def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> dict[str, float]:
-    """Kind of test that was not made -> by how much laws that fit about as well differ there, over their mean.
+    """Kind of tension that was not tested -> by how much laws that fit about as well differ there, over their mean.
 
     It is the largest difference of their nominal stress at stretches up to the largest first invariant of the tests,
     with a Prony series of the instantaneous one: how much relaxes is no question of the kind of test.
     """
     most = largest_invariant(tests)
-    made = {test.kind for test in tests}
+    made = {_kind_in_tension(test) for test in tests}
     spread = {}
     for kind in KINDS:
         if kind in made:
@@ -296,3 +298,9 @@ def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) 
         stresses = np.array([NominalStress(law, test)() for law in laws])
         spread[kind] = float(np.max(np.ptp(stresses, axis=0) / np.abs(stresses.mean(axis=0))))
     return spread
+
+
+def _kind_in_tension(test: MaterialTest) -> str:
+    """The kind of tension that strains as a test does: pressing a bar strains it as equal tension in two directions."""
+    pressed, pulled = 1.0 - float(np.min(test.stretch)), float(np.max(test.stretch)) - 1.0
+    return "biaxial" if test.kind == "uniaxial" and pulled < _RESTING * pressed else test.kind

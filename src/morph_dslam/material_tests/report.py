@@ -177,7 +177,7 @@ def fit_lines(figures: Mapping[str, Any]) -> list[str]:
         )
     wide = {kind: spread for kind, spread in figures["spread_where_not_tested"].items() if spread > _WIDE}
     if wide:
-        listed = ", ".join(f"{kind}: {100.0 * spread:.0f} %" for kind, spread in wide.items())
+        listed = ", ".join(f"{kind} tension: {100.0 * spread:.0f} %" for kind, spread in wide.items())
         said.append(
             f"note: laws that fit about as well differ where nothing was measured ({listed}); test that as well"
         )
@@ -237,7 +237,7 @@ def _draw(path: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]
             _draw_in_time(axes, best, tests, kind)
         else:
             _draw_over_stretch(axes, fitted, best, made, kind, most)
-        axes.set_title(f"{kind} tension" if made else f"{kind} tension, not tested: predicted{at_once}")
+        axes.set_title(kind if made else f"{kind} tension, not tested: predicted{at_once}")
         axes.set_ylabel("nominal stress, MPa")
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=DPI)
