@@ -23,6 +23,15 @@ def body():
     return np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64)
 
 
+@pytest.mark.parametrize("ratio", [0.78, 0.83, 0.87])
+def test_the_axis_of_a_can_whose_moments_are_nearly_equal_is_found(ratio):
+    """At 0.83 to 0.84 the moments about its axis and across it are the same."""
+    can = trimesh.creation.cylinder(0.035, 0.07 * ratio, sections=96).subdivide_to_size(0.01)
+    surface = Surface.of_mesh(can.vertices @ TRUE.rotation.T, np.asarray(can.faces, dtype=np.int64))
+    assert surface.axis_of_revolution is not None
+    assert abs(surface.axis_of_revolution.direction @ TRUE.rotation[:, 2]) > 1.0 - 1e-6
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", [False, True])
 def test_the_start_nearest_to_the_truth_ends_there_and_comes_first(metric):

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 N_SAMPLES = 12000
 #: A surface turned about its axis of revolution stays where it was, up to this part of its size.
 SYMMETRY_TOLERANCE = 0.01
+#: Second moments of the area that differ by less than this share are equal.
+EQUAL_MOMENTS = 0.02
 #: At 95 % of a surface, a sample is nearer than so many times the median distance of samples; of random ones it is
 #: nearer than twice that.
 FARTHEST_SAMPLE = 4.0
@@ -39,11 +41,14 @@ class Surface:
     points : (n, 3) object frame, metres.
     normals : (n, 3) of unit length.
     closed : whether it has an inside, and is seen from the side to which its normals point.
+    axes : (3 or 6, 3) of unit length, of which one is the axis of any symmetry: the principal axes of the area's
+        inertia, that of the largest moment first. Equal moments leave them open: then also those of the mesh's frame.
     """
 
     points: Array
     normals: Array
     closed: bool
+    axes: Array
 
     @classmethod
     def of_mesh(cls, nodes: Array, triangles: NDArray[np.int64], count: int = N_SAMPLES) -> Surface:
@@ -55,7 +60,7 @@ class Surface:
         points = np.einsum("pc,pcx->px", samples.weights, nodes[chosen])
         normals = triangle_normals(nodes, chosen)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return cls(points, normals, closed=bool((uses == 2).all()))
+        return cls(points, normals, bool((uses == 2).all()), _symmetry_axes(nodes, triangles))
 
     @cached_property
     def tree(self) -> KDTree:
@@ -107,13 +112,11 @@ class Surface:
     def axis_of_revolution(self) -> Axis | None:
         """The axis about which the surface may be turned by any angle; None if there is none.
 
-        It can only be a principal axis of the surface's inertia. Turned about it by a few angles, of which
-        none is a simple fraction of a turn, the surface has to lie on itself.
+        Turned about it by a few angles, of which none is a simple fraction of a turn, the surface has to lie on itself.
         """
-        _, principal = np.linalg.eigh(np.cov((self.points - self.centre).T))
         spacing = float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
         allowed = SYMMETRY_TOLERANCE * self.size
-        for direction in principal.T[::-1]:
+        for direction in self.axes:
             axis = Axis(self.centre, direction)
             farthest = 0.0
             for angle in (0.37, 1.0, 1.93, 2.81):
@@ -127,6 +130,23 @@ class Surface:
             if farthest <= max(allowed, 0.5 * spacing):
                 return axis
         return None
+
+
+def _symmetry_axes(nodes: Array, triangles: NDArray[np.int64]) -> Array:
+    """Directions (3 or 6, 3) as of `Surface.axes`, from the exact second moments of the triangles.
+
+    Those of samples would tilt the axis of a body whose moments are nearly equal. The second moments of a triangle are
+    those of its three corners and of its middle with nine times their weight, of a twelfth of the area.
+    """
+    corners = nodes[triangles]
+    areas = np.linalg.norm(triangle_normals(nodes, triangles), axis=1)
+    middles = corners.mean(axis=1)
+    centre = areas @ middles / areas.sum()
+    places = np.concatenate([corners - centre, 3.0 * (middles - centre)[:, None]], axis=1)
+    moments = np.einsum("m,mcx,mcy->xy", areas, places, places) / (12.0 * areas.sum())
+    values, vectors = np.linalg.eigh(moments)
+    principal = vectors.T[::-1]
+    return np.vstack([principal, np.eye(3)]) if np.diff(values).min() < EQUAL_MOMENTS * values[-1] else principal
 
 
 def fit_surface(
