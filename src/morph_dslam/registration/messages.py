@@ -26,6 +26,7 @@ class Ambiguity(StrEnum):
     SECOND_PLACE = "second_place"
     UNCONFIRMED = "unconfirmed"
     IMAGES_DIFFER = "images_differ"
+    TURNED = "turned"
 
 
 _AMBIGUITIES = {
@@ -41,6 +42,8 @@ _AMBIGUITIES = {
     "would do; look at registration.jpg, and give landmarks if it is wrong",
     Ambiguity.IMAGES_DIFFER: "the keyframes' images differ by {value:.2f} px on the object; look at "
     "registration.jpg, and give landmarks if it is wrong",
+    Ambiguity.TURNED: "undeformed, the object looks the same turned by {value:.0f} degrees, but it does not deform the "
+    "same then; give landmarks on sides that you can tell apart",
 }
 
 
@@ -51,7 +54,8 @@ class Ambiguous(RegistrationWarning):
     Attributes
     ----------
     why : what makes it so.
-    value : the number of shapes, the share of the second place or print, or the difference in pixels.
+    value : the number of shapes, the share of the second place or print, the difference in pixels, or the turn in
+        degrees.
     """
 
     why: Ambiguity
@@ -470,6 +474,21 @@ class TurnArbitrary(RegistrationWarning):
     """A rigid object can be turned about its axis without a difference."""
 
     template: ClassVar[str] = "the object is the same all around its axis: the pose's turn about it is arbitrary"
+
+
+@dataclass(frozen=True)
+class AttitudeArbitrary(RegistrationWarning):
+    """An object can be turned without a difference, by a part of a turn.
+
+    Attributes
+    ----------
+    degrees : the turn.
+    """
+
+    template: ClassVar[str] = (
+        "the object is the same turned by {degrees:.0f} degrees: which of these attitudes its pose has is arbitrary"
+    )
+    degrees: float
 
 
 @dataclass(frozen=True)

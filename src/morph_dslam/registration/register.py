@@ -43,6 +43,7 @@ from morph_dslam.registration.registration import (
     registration_in_map,
 )
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, views_apart, views_of
+from morph_dslam.registration.symmetry import turn_warning
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
@@ -118,6 +119,8 @@ def register(
         warnings += (off,)
     if scene.is_metric and not same_size(found.world_from_object.scale):
         warnings += (OtherSize(found.world_from_object.scale),)
+    if landmarks is None and guess is None and (turned := turn_warning(model, found.axis)):
+        warnings += (turned,)
     if region is not None and found.ambiguous:
         warnings += (OnlyInBox(region[0]),)
     placed = registration_in_map(model, in_map, keyframes, facts, warnings, found.axis, scene)
