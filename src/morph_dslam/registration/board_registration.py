@@ -279,13 +279,38 @@ def _find_in_map(board: FiducialBoard, views: Sequence[View], camera: Camera) ->
             f"the board does not stand still in the map, or its file is wrong: corners are {rms:.1f} px off",
             RegistrationFailure.BOARD_DOES_NOT_FIT,
         )
-    variance = max(float(misfit @ misfit) / max(len(misfit) - 7, 1), LEAST_CORNER_PX**2)
-    covariance = variance * np.linalg.pinv(found.jac.T @ found.jac) * np.outer(units, units)
     # An order that has no pose in some of the keyframes does not fit there.
     as_many = [other for other in others if len(other) == len(best)]
     open_order = any(_fits_as_well(_total_cost(other), _total_cost(best)) for other in as_many)
     world = moved_similarity(start, found.x * units, centre)
-    return _BoardInMap(world, covariance, centre, len(seen), rms, open_order)
+    return _BoardInMap(world, _covariance(world, centre, seen, camera), centre, len(seen), rms, open_order)
+
+
+def _covariance(
+    world: SimilarityTransform, centre: Array, seen: Sequence[tuple[View, Array, Array]], camera: Camera
+) -> Array:
+    """(7, 7) of log scale, rotation vector and translation about ``centre``, world.
+
+    Most of the residuals are errors of the keyframes' poses, which all corners of one keyframe share: of each keyframe
+    they count as one pose that is off. Its covariance is that of all keyframes together, whose 6 numbers each leave 7
+    less. Errors of single corners are added, so that two keyframes do not seem exact where they happen to agree.
+    """
+    in_map = MapRegistration(world, centre, None)
+    information, by_poses, away, single = np.zeros((7, 7)), [], [], 0.0
+    for view, points, pixels in seen:
+        pose = camera_from_object(view, world)
+        residuals, jacobian = _linear(pose, points, pixels, camera)
+        weight, slopes = jacobian.T @ jacobian, in_map.slopes(pose)
+        off = np.linalg.lstsq(jacobian, -residuals, rcond=None)[0]
+        away.append(off)
+        single += float(np.sum((residuals + jacobian @ off) ** 2))
+        information += slopes.T @ weight @ slopes
+        by_poses.append(slopes.T @ weight)
+    of_pose = 6.0 * np.array(away).T @ np.array(away) / (6.0 * len(seen) - 7.0)
+    variance = max(single / sum(2 * len(points) - 6 for _, points, _ in seen), LEAST_CORNER_PX**2)
+    inverse = np.linalg.pinv(information)
+    gradients = sum(part @ of_pose @ part.T for part in by_poses)
+    return np.asarray(inverse @ (gradients + variance * information) @ inverse, dtype=np.float64)
 
 
 #: The views that show the board, its corners, their pixels, and its pose.
