@@ -71,6 +71,22 @@ def test_few_points_that_agree_less_closely_are_doubted_by_what_is_unusual(recov
     assert recovery.doubt(attempt(0.3, 0.5)) == pytest.approx(0.4)  # 0.5² = 0.3² + 0.4²
 
 
+def test_an_object_that_leaves_the_picture_or_turns_away_is_not_doubted_for_that(recovery):
+    """Nine tenths of the points in sight agree, of which a third of all is left."""
+    assert recovery.doubt(attempt(0.3, 0.5, visible=0.33)) == 0.0
+    assert recovery.doubt(attempt(0.3, 0.5, visible=0.33, prior=object())) == 0.0
+
+
+def test_a_state_that_has_most_points_out_of_sight_is_doubted_where_the_others_agree_as_what_looks_alike(recovery):
+    assert recovery.doubt(attempt(0.3, 1.7, visible=0.33)) == pytest.approx(np.sqrt(1.7**2 - 0.3**2))
+    lost = recovery.reject(attempt(0.1, 0.5, visible=0.12), followed=True)
+    assert lost is not None
+    assert lost.reason is RejectionReason.FEW_POINTS
+    lost = recovery.reject(attempt(0.2, 3.5, visible=0.22, alike=True), followed=True)
+    assert lost is not None
+    assert lost.reason is RejectionReason.LOOSE_AGREEMENT
+
+
 def test_with_a_pose_from_the_map_fewer_points_will_do(recovery):
     assert recovery.doubt(attempt(0.4, 2.0, prior=object())) == 0.0
     assert recovery.doubt(attempt(0.2, 0.5, prior=object())) == pytest.approx(0.4)

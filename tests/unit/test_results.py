@@ -342,3 +342,18 @@ def test_points_hidden_by_the_object_or_turned_away_are_not_visible():
     area = 0.5 * 0.2**2 * CAMERA.fx * CAMERA.fy
     assert visible(front, 0.99 * area) == [True, True, False, False]
     assert visible(front, 1.01 * area) == [False, False, False, False]
+
+
+RIM = [(8, 240, True), (7, 240, False), (630, 240, True), (631, 240, False), (320, 7, False), (320, 471, False)]
+
+
+@pytest.mark.parametrize(("column", "row", "is_whole"), RIM)
+def test_points_whose_windows_leave_the_picture_are_not_visible(column, row, is_whole):
+    """A patch of 15 pixels and one more on each side, of which a place between pixels needs the next one."""
+    pixels = np.array([[column, row]], dtype=np.float64)
+    corner_pixels = pixels + np.array([[-100.0, 100.0], [100.0, 100.0], [0.0, -200.0]])
+    corners, depth = np.tile([0.0, 0.0, 1.0], (3, 1)), np.ones((480, 640), np.float32)
+    found = visible_surface(
+        corners, corner_pixels, np.array([False]), np.zeros(1), corners[:1], pixels, depth, 0.01
+    )  # fmt: skip
+    assert found.tolist() == [is_whole]

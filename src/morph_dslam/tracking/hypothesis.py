@@ -121,14 +121,14 @@ class PoseHypothesis:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Points that the object itself does not occlude, and those that support the estimate."""
+        """Points that the picture shows and the object itself does not occlude, and those that support the estimate."""
         if self.outline_alone and self.outline is not None:
             return int(self.outline.expected.sum()), int(self.outline.valid.sum())
         return int(self.measurement.visible.sum()), int(self.inliers.sum())
 
 
 def agree(hypothesis: PoseHypothesis, share: float) -> bool:
-    """Whether this share of all points support a hypothesis."""
+    """Whether this share of all points support a hypothesis, also those that it has out of sight."""
     return int(hypothesis.inliers.sum()) >= share * len(hypothesis.inliers)
 
 

@@ -212,7 +212,7 @@ class Measurement:
     pixels : (p, 2) where they were found, at the middle row's instant.
     recorded : (p, 2) where the image shows that; with a global shutter the same.
     valid : (p,) which to believe.
-    visible : (p,) which no other part of the object hides.
+    visible : (p,) which the picture shows whole, windows included, and no other part of the object hides.
     spread : (p,) how exactly by what the patches differ, pixels, up to a factor; see `compare_patches`.
     drawing : of the object, made for the comparison; None where there was none.
     rendered : (h, w), the reference view in the drawing's state, contrast-normalized; None where there was none.
@@ -231,6 +231,8 @@ class Measurement:
 def visible_surface(corners, corner_pixels, is_front, broadness, positions, pixels, depth, tolerance):
     """Which surface points show the side that the reference view shows, broadly enough, with nothing before them.
 
+    Their windows must be in the picture: a point at its rim cannot be compared, whether it is there or not.
+
     Parameters
     ----------
     corners, corner_pixels : (3 p, 3) in the camera frame, metres, and (3 p, 2) of each point's triangle.
@@ -240,7 +242,7 @@ def visible_surface(corners, corner_pixels, is_front, broadness, positions, pixe
     depth : (h, w) of the object, metres, infinite where it is not.
     tolerance : metres by which a point may be behind that.
     """
-    seen, (height, width) = np.zeros(len(positions), np.bool_), depth.shape
+    seen, (height, width), margin = np.zeros(len(positions), np.bool_), depth.shape, PATCH_HALF + 1
     for j in range(len(positions)):
         a, b, c = corner_pixels[3 * j], corner_pixels[3 * j + 1], corner_pixels[3 * j + 2]
         area = 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
@@ -248,7 +250,7 @@ def visible_surface(corners, corner_pixels, is_front, broadness, positions, pixe
         x, y = pixels[j, 0], pixels[j, 1]
         if (area > 0.0) != is_front[j] or not abs(area) * far**2 >= broadness[j]:
             continue
-        if -0.5 < x < width - 0.5 and -0.5 < y < height - 0.5:
+        if margin <= x < width - 1 - margin and margin <= y < height - 1 - margin:  # as `compare_patches` has it
             seen[j] = positions[j, 2] <= depth[int(np.rint(y)), int(np.rint(x))] + tolerance
     return seen
 

@@ -85,21 +85,24 @@ class Recovery:
     def doubt(self, attempt: PoseHypothesis) -> float:
         """By how much, pixels, the points that agree may be off together; 0 where nothing is doubtful.
 
-        Where something hides part of the object, or less than half of the points agree, and those not as
-        closely as usual, something else is in the windows of many: what their residuals have more than usual
-        is no noise that averages out.
+        Where something hides part of the object, and the points that agree do so less closely than usual, something
+        else is in the windows of many: what their residuals have more than usual is no noise that averages out. Of an
+        object that leaves the picture, or turns away, most points that are to be seen agree. Only where they do so no
+        more closely than what looks alike does, the state that has the others out of sight may itself be mistaken.
         """
         spread = attempt.estimate.sigma_px
         if np.isnan(self._usual_px) or not np.isfinite(spread):  # so few points that nothing is left of them
             return 0.0
         if self.is_loose(attempt):
             return float(np.sqrt(spread**2 - self._usual_px**2))
-        if self._known_by_map(attempt):  # fewer points tell as much
-            if agree(attempt, self._options.least_share):
-                return 0.0
-        elif agree(attempt, MOST_AGREE) and not self.partly_hidden(attempt):
+        is_known, to_usual = self._known_by_map(attempt), CLOSE_TO_USUAL
+        if is_known and _agree_of_visible(attempt, self._options.least_share):  # fewer points tell as much
             return 0.0
-        if spread < CLOSE_TO_USUAL * self._usual_px:
+        if not is_known and not self.partly_hidden(attempt):
+            if agree(attempt, MOST_AGREE):
+                return 0.0
+            to_usual = ALIKE_TO_USUAL
+        if spread < to_usual * self._usual_px:
             return 0.0
         return float(np.sqrt(spread**2 - self._usual_px**2))
 
@@ -141,7 +144,7 @@ class Recovery:
 
     def partly_hidden(self, attempt: PoseHypothesis) -> bool:
         """Whether something else seems to be before the object."""
-        return int(attempt.inliers.sum()) < UNHIDDEN * int(attempt.measurement.visible.sum())
+        return not _agree_of_visible(attempt, UNHIDDEN)
 
     def brought_in_reach(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Compare once more in the state that was found, where few points agree and some were out of reach before."""
@@ -357,6 +360,11 @@ class Recovery:
                 shape[k] = lower[k] + share * (upper[k] - lower[k])
                 shapes.append(shape)
         return shapes
+
+
+def _agree_of_visible(attempt: PoseHypothesis, share: float) -> bool:
+    """Whether this share of the points that an attempt has in sight support it."""
+    return int(attempt.inliers.sum()) >= share * int(attempt.measurement.visible.sum())
 
 
 def _is_taken(picture: Image, place: PoseHypothesis) -> bool:

@@ -58,7 +58,7 @@ class FrameResult:
     few_corners : how many corners the object's texture shows in the reference, and how many are needed, where these are
         too few to follow it by; None where they are enough, or nobody asked for texture.
     pose_prior : the pose by the map, where that alone gives it.
-    n_points : number of points that the object itself does not occlude.
+    n_points : number of points that the picture shows and the object itself does not occlude.
     n_inliers : number of those that support the estimate.
     residual_rms_px : root mean square of the inliers' residuals, pixels, NaN unless tracked.
     unexplained_px : what the model leaves of the residuals, pixels, see `systematic_errors`; NaN unless tracked.
