@@ -100,3 +100,50 @@ def test_a_weighted_sample_is_met_more_closely() -> None:
         missed.append(abs(functions.evaluate(LOWER)[0][0] - at_corner))
     assert missed[0] > 0.1
     assert missed[1] < 1e-4
+
+
+def grid(*levels: int) -> np.ndarray:
+    """All points (n, d) of a grid of the unit box."""
+    axes = np.meshgrid(*(np.linspace(0.0, 1.0, count) for count in levels), indexing="ij")
+    return np.stack(axes, axis=-1).reshape(-1, len(levels))
+
+
+@pytest.mark.parametrize("levels", [(3, 3, 3, 3), (3, 6, 6)])
+def test_between_few_levels_no_polynomial_is_taken_that_they_do_not_determine(levels: tuple[int, ...]) -> None:
+    """The function is of degree 1 in each parameter: three levels determine it, and left-out samples of a grid are met
+    by many others too."""
+    x, d = grid(*levels), len(levels)
+    x = np.random.default_rng(0).permutation(x)[: 4 * len(x) // 5]
+
+    def function(mu: np.ndarray) -> np.ndarray:
+        return np.column_stack([1.0 + mu @ np.arange(1.0, d + 1.0), mu[:, 0] * mu[:, 1] * mu[:, -1]])
+
+    folds = np.arange(len(x))
+    fit, _ = fit_functions(x, function(x), None, np.zeros(d), np.ones(d), 8, folds, raise_single=True)
+    new = np.random.default_rng(1).random((100, d))
+    assert np.array([fit.evaluate(mu)[0] for mu in new]) == pytest.approx(function(new), abs=1e-5)
+    assert (fit.multi_indices.max(axis=0) < levels).all()
+
+
+@pytest.mark.parametrize("levels", [(2, 9), (3, 9)])
+def test_slopes_at_levels_determine_twice_the_degree(levels: tuple[int, int]) -> None:
+    """exp(0.8 x) sin(5 y): along x, cubics through values and slopes at both ends err by 0.8^4 e^0.8 / 384 at most."""
+    x, new = grid(*levels), np.random.default_rng(0).random((200, 2))
+
+    def function(mu: np.ndarray) -> np.ndarray:
+        return np.exp(0.8 * mu[:, :1]) * np.sin(5.0 * mu[:, 1:])
+
+    slopes = np.stack([0.8 * function(x), 5.0 * np.exp(0.8 * x[:, :1]) * np.cos(5.0 * x[:, 1:])], axis=1)
+    folds = np.arange(len(x))
+    fit, _ = fit_functions(x, function(x), slopes, np.zeros(2), np.ones(2), 8, folds, raise_single=True)
+    assert np.array([fit.evaluate(mu)[0] for mu in new]) == pytest.approx(function(new), abs=5e-3)
+
+
+def test_a_plane_is_the_fit_of_degree_one() -> None:
+    x = samples(40, 6)
+    plane = 1.0 + x @ np.array([2.0, -1.0, 0.1])
+    for raise_single in (False, True):
+        fit, errors = fit_functions(x, plane[:, None], None, LOWER, UPPER, 1, np.arange(40), raise_single=raise_single)
+        assert list(errors) == [1]
+        new = samples(10, 7)
+        assert [fit.evaluate(mu)[0][0] for mu in new] == pytest.approx(1.0 + new @ np.array([2.0, -1.0, 0.1]), abs=1e-5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,16 @@ class _Trial:
     right: Array
 
 
+def _determined(samples: Array, lower: Array, upper: Array, conditions: int) -> NDArray[np.int64]:
+    """The number of degrees (d,), zero included, that samples (n, d) determine along each parameter.
+
+    A polynomial of one variable has as many coefficients as it has ``conditions`` at all levels together: 1 each, 2
+    where slopes are known. One of a higher degree may be zero at all of them.
+    """
+    unit = np.round((samples - lower) / (upper - lower), 9)
+    return conditions * np.array([len(np.unique(levels)) for levels in unit.T])
+
+
 class _Regression:
     """Samples (n, d) in a box, with targets (1 or 1 + d, n, n_functions) by the scaled parameters, and weights (n,)."""
 
@@ -87,6 +98,19 @@ class _Regression:
         of_kinds = np.where(np.arange(len(targets)) == 0, 1.0, gradient_weight)
         self._weights = np.multiply.outer(of_kinds, weights[order])[:, :, None]
         self._targets = targets[:, order] * self._weights
+        #: Each parameter's degree must be below its number (d,) here.
+        self.degrees = _determined(samples, box[0], box[1], 1 if len(targets) == 1 else 2)
+
+    def total_degree(self, degree: int) -> NDArray[np.int64]:
+        """The multi-indices (n_terms, d) of a total degree that the samples determine."""
+        return self._known(total_degree_indices(len(self.degrees), degree))
+
+    def weighted_degree(self, degrees: Sequence[int]) -> NDArray[np.int64]:
+        """The multi-indices (n_terms, d) of degrees of the parameters that the samples determine."""
+        return self._known(weighted_degree_indices(degrees))
+
+    def _known(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        return indices[(indices < self.degrees).all(axis=1)]
 
     def suits(self, indices: NDArray[np.int64]) -> bool:
         """Whether there are enough samples for so many terms when a fold is left out."""
@@ -131,6 +155,9 @@ def fit_functions(
 ) -> tuple[ParameterFunctions, dict[int, float]]:
     """Polynomials of the total degree that predicts left-out samples best.
 
+    Of samples that have few levels along a parameter, as a table of tests has, no higher degree than these levels
+    determine: between them it would be arbitrary, and no left-out sample tells, for all lie on the same levels.
+
     Parameters
     ----------
     samples : (n, d).
@@ -155,10 +182,12 @@ def fit_functions(
     fit = _Regression(samples, targets, np.array([lower, upper]), groups % FOLDS, gradient_weight, weights)
     errors: dict[int, float] = {}
     best: _Trial | None = None
-    for degree in range(2, max_degree + 1):
-        indices = total_degree_indices(d, degree)
-        if not fit.suits(indices):
+    terms = 0
+    for degree in range(min(2, max_degree), max_degree + 1):
+        indices = fit.total_degree(degree)
+        if not fit.suits(indices) or len(indices) == terms:
             break
+        terms = len(indices)
         trial = fit.trial(indices)
         errors[degree] = trial.missed
         if best is None or trial.missed < best.missed:
@@ -172,11 +201,12 @@ def fit_functions(
 
 def _raised(fit: _Regression, best: _Trial, highest: int) -> _Trial:
     """The best with the degrees of single parameters raised by half while that predicts better."""
-    degrees = best.indices.max(axis=0).tolist()
+    most = np.minimum(fit.degrees - 1, highest).tolist()
+    degrees = [int(best.indices.sum(axis=1).max())] * len(most)
     for k in range(len(degrees)):
-        while degrees[k] < highest:
-            tried = [*degrees[:k], min(3 * degrees[k] // 2, highest), *degrees[k + 1 :]]
-            indices = weighted_degree_indices(tried)
+        while degrees[k] < most[k]:
+            tried = [*degrees[:k], min(max(3 * degrees[k] // 2, 2), most[k]), *degrees[k + 1 :]]
+            indices = fit.weighted_degree(tried)
             if len(indices) > MOST_TERMS or not fit.suits(indices):
                 break
             trial = fit.trial(indices)
