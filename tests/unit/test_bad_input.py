@@ -173,11 +173,12 @@ def test_a_folder_that_holds_a_run_or_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     make_run_folder(tmp_path / "a" / "run", overwrite=False)
     assert (tmp_path / "a" / "run").is_dir()
-    for sign in ("result.h5", "trajectory.txt"):
-        (tmp_path / "a" / "run" / sign).write_text("")
+    for command, sign in (("track", "result.h5"), ("slam", "map.h5")):
+        (tmp_path / command).mkdir()
+        (tmp_path / command / sign).write_text("")
         with pytest.raises(TrackingError, match="holds a run already"):
-            make_run_folder(tmp_path / "a" / "run", False, sign)
-        make_run_folder(tmp_path / "a" / "run", True, sign)
+            make_run_folder(tmp_path / command, False, command)
+        make_run_folder(tmp_path / command, True, command)
     for name in ("file", "file/run"):
         with pytest.raises(TrackingError, match="cannot write the run to"):
             make_run_folder(tmp_path / name, overwrite=True)

@@ -22,7 +22,7 @@ def test_an_input_is_never_emptied(name, command, tmp_path, refused):
     """Under another name too; were it empty, it would still be the wrong file."""
     (tmp_path / "log").symlink_to(tmp_path / name)
     (tmp_path / name).write_text(LINE)
-    assert "log is an input of this run" in refused(*command, tmp_path / "log")
+    assert "log is an input of this command" in refused(*command, tmp_path / "log")
     assert (tmp_path / name).read_text() == LINE
     assert not (tmp_path / "run").exists()
 

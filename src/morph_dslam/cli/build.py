@@ -65,10 +65,12 @@ def build_study(study: Path, output: Path, workers: int | None = None, curve: Pa
     """Build the model of a study file, write its report, and print what came of it."""
     from morph_dslam import build, write_build_report
     from morph_dslam.extend.mechanics import NearlyIncompressibleWarning
+    from morph_dslam.extend.models import check_no_input
     from morph_dslam.extend.reduction import read_reference_curve, report_path
     from morph_dslam.extend.reports import error_facts
     from morph_dslam.extend.studies import build_warnings
 
+    check_no_input([output], [curve], StudyError)
     reference = None if curve is None else read_reference_curve(curve)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # printed once, at the end

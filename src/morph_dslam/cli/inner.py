@@ -3,6 +3,7 @@
 import argparse
 
 from morph_dslam.cli.arguments import LENGTH_UNITS, add_file, add_output
+from morph_dslam.errors import StudyError
 
 HELP = "place a surface (a tumour, a vessel) inside of a solid, to be carried along by its model"
 KEPT = "nothing was written"
@@ -18,9 +19,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     from morph_dslam import load_model
-    from morph_dslam.extend.models import save_inner_structure
+    from morph_dslam.extend.models import check_no_input, save_inner_structure
     from morph_dslam.extend.studies import described_inner, inner_size_note, read_inner_structure
 
+    check_no_input([arguments.output], [arguments.model, arguments.surface], StudyError)
     model = load_model(arguments.model)
     name = arguments.name or arguments.surface.stem
     structure = read_inner_structure(model, name, arguments.surface, arguments.unit)

@@ -1,6 +1,7 @@
 """What reduced models are made of: separated fields, functions, points that a model carries; and what a file is."""
 
 from morph_dslam.io.file_kinds import MESHES as MESHES, file_kind as file_kind
+from morph_dslam.io.writing import check_no_input as check_no_input
 from morph_dslam.model import (
     MaterialPoints as MaterialPoints,
     SeparatedField as SeparatedField,

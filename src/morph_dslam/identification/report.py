@@ -357,8 +357,8 @@ RESULT = "identification.json"
 
 def check_no_identification(folder: str | Path, overwrite: bool) -> None:
     """Raise IdentificationError if a folder holds an identification that is not to be overwritten."""
-    folder = Path(folder)
-    check_free(folder / RESULT, "an identification", overwrite, IdentificationError)
+    names = (RESULT, "identification.png")
+    check_free(Path(folder), names, "an identification", overwrite, IdentificationError)
 
 
 def write_identification(folder: str | Path, found: Identification) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from morph_dslam.interrupts import WaitingInterrupts
 from morph_dslam.io.gltf import GENERATOR, Colours, write_glb
 from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.state_choice import EACH_IN_TURN, StateChoice, States, states_of_array
-from morph_dslam.io.writing import removed_on_failure
+from morph_dslam.io.writing import check_no_input, removed_on_failure
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import CarriedStructure, load_inner_structures
 from morph_dslam.model.reduced_model import von_mises
@@ -42,7 +42,7 @@ def write_table(path: Path, states: States, places: Sequence[dict[str, str | int
     so that a study can be made from an export.
     """
     parameters = states.model.parameters
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with removed_on_failure(path), path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*places[0], *states.origins[0], *(f"{p.name} [{p.unit}]" for p in parameters)])
         for place, origin, mu in zip(places, states.origins, states.parameters, strict=False):
@@ -132,23 +132,39 @@ def _cells(model: ReducedModel) -> list[tuple[str, ArrayLike] | meshio.CellBlock
 _HEAD = 4096
 
 
-def _remove_export(folder: Path, stem: str) -> None:
-    """Remove what an export of this name has written, in any format: it would pass for states of the next.
-
-    Files that others have written under these names are left alone.
-    """
+def _earlier_export(folder: Path, stem: str) -> list[Path]:
+    """What an export of this name has written, in any format, and others have not."""
     series, collection, animation = (folder / f"{stem}.{ending}" for ending in ("xdmf", "pvd", "glb"))
-    own = rf'file="({re.escape(escape(stem))}_(?:{_INNER}\w+_)?\d{{4,}}\.vtu)"'
+    name = re.escape(escape(stem))
+    own = rf'file="({name}_(?:{_INNER}[\w.+-]+_)?\d{{4,}}\.vtu)"'
     written = [folder / unescape(name) for name in re.findall(own, _beginning(collection))]
     found = [*written, collection] if written else []
     head = _beginning(series, _HEAD)
-    if _XDMF_SERIES in head and f">{stem}.h5:/" in head:
+    if _XDMF_SERIES in head and f">{escape(stem)}.h5:/" in head:
         found += [series, series.with_suffix(".h5")]
     if _GLB_GENERATOR in _beginning(animation, _HEAD):
         found.append(animation)
-    if found:
-        found.append(folder / "states.csv")
-    for path in found:
+    return [*found, folder / "states.csv"] if found else []
+
+
+def _make_way(folder: Path, stem: str, file_format: FileFormat, inputs: Sequence[str | Path | None]) -> None:
+    """Remove the export of this name that is there, which would pass for states of the next.
+
+    Raises
+    ------
+    ExportError
+        If what is to be written would take the place of a file that no export has written, or of an input.
+    """
+    endings = {"xdmf": ("xdmf", "h5"), "vtu": ("pvd",), "gltf": ("glb",)}[file_format]
+    targets = [folder / "states.csv", *(folder / f"{stem}.{ending}" for ending in endings)]
+    stems = {path.stem for ending in ("xdmf", "pvd", "glb") for path in folder.glob(f"*.{ending}")}
+    of_exports = {name: _earlier_export(folder, name) for name in stems}
+    earlier = of_exports.get(stem, [])
+    check_no_input([*targets, *earlier], inputs, ExportError)
+    for path in targets:
+        if path.exists() and all(path not in files for files in of_exports.values()):
+            raise ExportError(f"{path} is there, and no earlier export has written it: name another folder")
+    for path in earlier:
         path.unlink(missing_ok=True)
 
 
@@ -255,7 +271,8 @@ def export(
     Parameters
     ----------
     model : a model or its file.
-    folder : to write into; made if missing. An export of the same name that is there is replaced, in whatever format.
+    folder : to write into; made if missing. An export of the same name that is there is replaced, in whatever format;
+        other files are not.
     file_format : "xdmf" or "vtu" for ParaView, "gltf" for 3-D viewers.
     choice : of the states, by default each parameter in turn; or their parameters (s, d), SI.
     show : what colours a glTF file: "stress" (von Mises), "strain" (equivalent), "displacement", or "none"; by default
@@ -270,7 +287,8 @@ def export(
     ParameterError
         If the model does not hold what is to be shown.
     ExportError
-        If there is no such format, the states are not in the model's box, or the folder cannot be written.
+        If there is no such format, the states are not in the model's box, or the folder cannot be written, or holds
+        files of such names that no export has written.
     """
     if file_format not in get_args(FileFormat):
         raise ExportError(f"'{file_format}' is no format of an export; these are {', '.join(get_args(FileFormat))}")
@@ -294,7 +312,7 @@ def export(
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _remove_export(folder, stem)
+        _make_way(folder, stem, file_format, [choice.path if isinstance(choice, StateChoice) else None, *inner])
         if file_format == "gltf":
             target = _write_animation(folder, stem, states, show)
         else:

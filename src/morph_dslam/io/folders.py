@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
 from morph_dslam.errors import MorphError, TrackingError
 
@@ -14,50 +15,91 @@ if sys.platform != "win32":
     import fcntl
 
 
-def check_free(sign: Path, held: str, overwrite: bool, kind: type[MorphError]) -> None:
-    """Raise an error of a kind if a folder holds an earlier result that is not to be overwritten.
+def check_free(folder: Path, names: Sequence[str], held: str, overwrite: bool, kind: type[MorphError]) -> None:
+    """Raise an error of a kind if a folder holds files that are not to be overwritten.
 
     Parameters
     ----------
-    sign : the file in the folder by which such a result is known.
-    held : what it is, "a run" say.
-    overwrite : whether the folder may hold it.
+    folder : that is written to; it may be missing.
+    names : of the files that are written. By the first one an earlier result is known.
+    held : what that is, "a run" say.
+    overwrite : whether the folder may hold them.
     """
-    if sign.exists() and not overwrite:
+    found = [] if overwrite else [name for name in names if (folder / name).exists()]
+    if found:
+        what = held if found[0] == names[0] else found[0]
         raise kind(
-            f"{sign.parent} holds {held} already: choose another folder, or allow it to be overwritten (`--overwrite`)"
+            f"{folder} holds {what} already: choose another folder, or allow it to be overwritten (`--overwrite`)"
         )
 
 
+Command = Literal["track", "slam"]
+#: What each run writes, by the command; the first one is the file by which such a run is known.
+_WRITTEN: dict[Command, tuple[str, ...]] = {
+    "track": ("result.h5", "frames.csv", "trajectory.txt", "camera.yaml", "model.morph", "summary.json"),
+    "slam": ("map.h5", "frames.csv", "trajectory.txt", "map.ply", "summary.json", "colmap"),
+}
 #: What not every run and evaluation writes into its folder, or not under the same names, and reports show.
-_OF_ONE_RUN = (
-    *("plots/*.png", "augmented.mp4", "latency.csv", "report.html"),
-    *("*evaluation.json", "*evaluation.png", "*error_map.png"),
-)
+_OF_ONE_RUN: dict[Command, tuple[str, ...]] = {
+    "track": (
+        *("plots/*.png", "augmented.mp4", "latency.csv", "report.html"),
+        *("*evaluation.json", "*evaluation.png", "*error_map.png"),
+    ),
+    "slam": ("plots/*.png", "report.html", "*evaluation.json", "*evaluation.png"),
+}
 
 
-def make_run_folder(folder: Path, overwrite: bool, sign: str = "result.h5") -> None:
+def _holds_run(folder: Path, command: Command) -> bool:
+    return (folder / _WRITTEN[command][0]).exists()
+
+
+def make_run_folder(folder: Path, overwrite: bool, command: Command = "track") -> None:
     """Make a run folder and those above it.
 
     Parameters
     ----------
     folder : to make.
-    overwrite : whether it may hold a run already.
-    sign : the file by which a run that is there already is known.
+    overwrite : whether it may hold a run already, and files called as those of a run.
+    command : that writes the run.
 
     Raises
     ------
     TrackingError
-        If it cannot be made, or holds a run already that is not to be overwritten.
+        If it cannot be made, or holds a run of the other command, or one that is not to be overwritten.
     """
-    check_free(folder / sign, "a run", overwrite, TrackingError)
+    for other in _WRITTEN:
+        if other != command and _holds_run(folder, other):
+            raise TrackingError(
+                f"{folder} holds a run of `morph {other}`, whose files would be gone: choose another one"
+            )
+    check_free(folder, _WRITTEN[command], "a run", overwrite, TrackingError)
     _make(folder)
 
 
-def clear_run_folder(folder: Path) -> None:
-    """Delete pictures and evaluations of the run that is overwritten: they would stand in the report of the new one."""
-    for old in (path for pattern in _OF_ONE_RUN for path in folder.glob(pattern)):
-        old.unlink()
+def clear_run_folder(folder: Path, command: Command = "track", more: Sequence[Path] = ()) -> None:
+    """Delete pictures and evaluations of the run that is overwritten: they would stand in the report of the new one.
+
+    Where no run is they are somebody's own. What cannot be deleted stays: it may not cost the new results.
+
+    Parameters
+    ----------
+    folder : of the run.
+    command : that writes the new one.
+    more : files of the earlier run beside these.
+    """
+    if _holds_run(folder, command):
+        for path in (*_of_one_run(folder, command), *more):
+            with suppress(OSError):
+                path.unlink()
+
+
+def replaced_files(folder: Path, command: Command = "track") -> list[Path]:
+    """What a run writes into a folder, and what it deletes there."""
+    return [*(folder / name for name in _WRITTEN[command]), *_of_one_run(folder, command)]
+
+
+def _of_one_run(folder: Path, command: Command) -> list[Path]:
+    return [path for pattern in _OF_ONE_RUN[command] for path in folder.glob(pattern)]
 
 
 @contextmanager

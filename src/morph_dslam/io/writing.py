@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -34,3 +34,22 @@ def removed_on_failure(path: Path) -> Iterator[None]:
             if path.is_file():  # and no device
                 path.unlink()
         raise
+
+
+def check_no_input(outputs: Iterable[Path], inputs: Iterable[str | Path | None], kind: type[MorphError]) -> None:
+    """Raise an error of a kind if a file that is to be written is one of those that are read.
+
+    Parameters
+    ----------
+    outputs : files to write, whether they are there or not.
+    inputs : files and folders that are read; None for what is not given.
+    kind : of the error.
+    """
+    given = [Path(path) for path in inputs if path is not None]
+    for output in outputs:
+        for path in given:
+            with suppress(OSError):  # it is not there
+                if path.samefile(output):
+                    raise kind(
+                        f"{output} is an input of this command, and would be overwritten: write to another place"
+                    )

@@ -34,8 +34,7 @@ _MEGAPASCAL = 1e6
 
 def check_no_fit(folder: str | Path, overwrite: bool) -> None:
     """Raise IdentificationError if a folder holds a fit that is not to be overwritten."""
-    folder = Path(folder)
-    check_free(folder / RESULT, "a fit", overwrite, IdentificationError)
+    check_free(Path(folder), (RESULT, "material.toml", "fit.png"), "a fit", overwrite, IdentificationError)
 
 
 def write_fit(

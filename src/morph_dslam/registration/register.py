@@ -298,7 +298,8 @@ def run_registration(
     hints: dict[str, Any] = {"landmarks": landmarks, "distance": distance, "region": region, "guess": guess}
     if board is not None and (beside or any(hint is not None for hint in hints.values())):
         raise RegistrationError("a board says where the object is: leave out --beside and the hints")
-    check_free(output / "registration.json", "a registration", overwrite, RegistrationError)
+    names = ("registration.json", "registration.jpg")
+    check_free(output, names, "a registration", overwrite, RegistrationError)
     camera, model = load_camera(camera_path), load_model(model_path)
     others = [_load_beside(path, map_path) for path in beside]
     scene = load_scene(map_path, camera)

@@ -25,7 +25,7 @@ from morph_dslam.io.camera_files import load_camera, parse_camera, save_camera
 from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
-from morph_dslam.io.writing import removed_on_failure, writing
+from morph_dslam.io.writing import check_no_input, writing
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.render.environment import VALUES_PER_METRE, Motion, StaticScene, plan_motion, sensor_depth
@@ -41,6 +41,9 @@ N_TRUTH_POINTS = 300
 MIN_LANDMARKS, MIN_LANDMARKS_RIGID = 8, 4
 #: A point so far behind the depth buffer is hidden; less may be the surface's own slope within a pixel.
 HIDDEN_BY = 3e-3
+#: The file by which a simulation is known, and one that was not finished; what else it writes beside frames.
+_TRUTH, _UNFINISHED = "truth.npz", "truth.npz.partial"
+_WRITTEN = ("camera.yaml", "landmarks.csv", "depth.h5", "rgb.txt", "depth.txt", "groundtruth.txt")
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,24 @@ def _surroundings(scene: Scene, folder: Path, camera: Camera, motion: Motion) ->
     return StaticScene(scene.environment, folder, finer, positions, np.array(light.direction), light.ambient)
 
 
+def _check_folder(output: Path) -> None:
+    """Raise SceneError if a folder that holds no simulation has files of the names that one writes."""
+    if (output / _TRUTH).exists() or (output / _UNFINISHED).exists():
+        return
+    of_frames = [path for folder in ("frames", "depth") for path in _frames_in(output / folder)]
+    found = [path for path in (*of_frames, *(output / name for name in _WRITTEN)) if path.exists()]
+    if found:
+        raise SceneError(
+            f"{found[0]} is there and would be gone, and {output} holds no earlier simulation ({_TRUTH}): name another "
+            "folder"
+        )
+
+
+def _frames_in(folder: Path) -> list[Path]:
+    found = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in found if re.fullmatch(r"\d{6}\.(png|jpg)", path.name)]
+
+
 def _prepare_folder(output: Path) -> None:
     """Make the folders, and clear frames of an earlier simulation, which would mix with the new ones."""
     for folder in (output / "frames", output / "depth"):
@@ -188,10 +209,11 @@ def _prepare_folder(output: Path) -> None:
             f"cannot write {output / 'depth.h5'}: is another simulation writing to this folder? Name another folder, "
             "or wait for it"
         ) from error
-    for folder in (output / "frames", output / "depth"):
-        for path in folder.iterdir():
-            if re.fullmatch(r"\d{6}\.(png|jpg)", path.name):
-                path.unlink()
+    # Until the truth is written this says whose the frames are.
+    (output / _UNFINISHED).touch()
+    (output / _TRUTH).unlink(missing_ok=True)
+    for path in (*_frames_in(output / "frames"), *_frames_in(output / "depth")):
+        path.unlink()
     for name in ("depth.h5", "rgb.txt", "depth.txt", "groundtruth.txt"):
         (output / name).unlink(missing_ok=True)
 
@@ -230,17 +252,19 @@ def _truth_positions(world: _World, points: SurfacePoints) -> Array:
     )
 
 
-def _write_truth(path: Path, world: _World, positions: Array, visible: NDArray[np.bool_]) -> None:
+def _write_truth(output: Path, world: _World, positions: Array, visible: NDArray[np.bool_]) -> None:
     """Write what is known of surface points (T, p, 3), and the poses and parameters behind them."""
-    np.savez_compressed(
-        path,
-        frame=np.arange(world.scene.frames),
-        points_mm=positions * 1e3,
-        pixels=np.stack([world.camera.project_recorded(frame) for frame in positions]),
-        visible=visible,
-        parameters=world.motion.parameters,
-        camera_from_object=np.stack([pose.matrix for pose in world.motion.camera_from_object]),
-    )
+    with (output / _UNFINISHED).open("wb") as file:
+        np.savez_compressed(
+            file,
+            frame=np.arange(world.scene.frames),
+            points_mm=positions * 1e3,
+            pixels=np.stack([world.camera.project_recorded(frame) for frame in positions]),
+            visible=visible,
+            parameters=world.motion.parameters,
+            camera_from_object=np.stack([pose.matrix for pose in world.motion.camera_from_object]),
+        )
+    (output / _UNFINISHED).replace(output / _TRUTH)
 
 
 def _create_depth(file: h5py.File, world: _World) -> h5py.Dataset:
@@ -355,25 +379,27 @@ def simulate(scene_path: str | Path, output: str | Path, progress: bool = True) 
     Parameters
     ----------
     scene_path : the scene file.
-    output : the folder to write; made if missing, frames in it are replaced.
+    output : the folder to write; made if missing. An earlier simulation in it is replaced.
     progress : show a progress bar.
 
     Raises
     ------
     SceneError
         If the scene file is wrong, the motion it prescribes leaves the model's range or the camera's view, or the
-        folder cannot be written to.
+        folder cannot be written to, holds files of such names that no simulation has written, or an input.
     CameraError, ModelFileError
         If the camera or the model that it names cannot be read.
     """
-    world = _load_world(Path(scene_path))
-    renderer, output = world.renderer(), Path(output)
+    world, output = _load_world(Path(scene_path)), Path(output)
+    named = [name for name in (world.scene.model, world.scene.camera) if isinstance(name, str)]
+    check_no_input([output / name for name in _WRITTEN], [world.folder / name for name in named], SceneError)
+    renderer = world.renderer()
     with writing(SceneError, output):
+        _check_folder(output)
         _prepare_folder(output)
         save_camera(output / "camera.yaml", world.camera)
         save_landmarks(output / "landmarks.csv", _landmarks(world))
         truth = _truth_positions(world, _truth_points(world.model))
         visible = _render_frames(world, renderer, output, truth, progress)
-        with removed_on_failure(output / "truth.npz"):
-            _write_truth(output / "truth.npz", world, truth, visible)
         _write_lists(output, world)
+        _write_truth(output, world, truth, visible)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
 from morph_dslam.io.colmap import ColmapModel, read_colmap_model
-from morph_dslam.io.folders import clear_run_folder, make_run_folder, only_writer
+from morph_dslam.io.folders import clear_run_folder, make_run_folder, only_writer, replaced_files
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.io.writing import check_no_input
 from morph_dslam.slam.camera_terms import CameraTerm, with_terms_of
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.options import SlamOptions
@@ -118,16 +120,20 @@ def run_slam(
     images = None if images is None else Path(images)
     options, start = options or SlamOptions(), _Start(map_path, trajectory, images)
     start.check(options, refine)
+    own_camera = output / "camera.yaml"
+    written = [*replaced_files(output, "slam"), *([own_camera] if refine or overwrite else [])]
+    grown = map_path if options.extend else None  # it may take its own place
+    given = [source, str(camera).partition("#")[0], None if grown else map_path, trajectory, images]
+    check_no_input(written, given, MapError)
     one_or_two = load_camera_or_pair(camera)
     stream = open_stream(source, first, last, fps, depth_per_metre)
     more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}
     if depth_per_metre is not None:
         more["inputs"]["depth_per_metre"] = depth_per_metre
     with stream if isinstance(stream, LiveStream) else nullcontext(), only_writer(output):
-        make_run_folder(output, overwrite, "trajectory.txt")
+        make_run_folder(output, overwrite, "slam")
         if refine:
             one_or_two, more["refined_camera"] = _refined(stream, one_or_two, refine, options, progress)
-            save_camera(output / "camera.yaml", one_or_two)
         known, recorded = start.known(one_or_two), None
         if isinstance(known, Trajectory | ColmapModel):
             recorded = open_source(images or source, fps=None if images else fps)
@@ -153,9 +159,23 @@ def run_slam(
             summary: dict[str, Any] = {}
             if frames:
                 scene = replace(finish_scene(slam, frames, again), refined=tuple(refine))
-                clear_run_folder(output)
+                _clear(output, video)
+                if refine:
+                    save_camera(own_camera, one_or_two)
                 summary = write_run(output, scene, more, notes)
     return summary
+
+
+def _clear(output: Path, video: bool) -> None:
+    """Delete what the run writes that is overwritten, and this one does not: also its video and its camera file.
+
+    A camera file in the folder of a run that made none is somebody's own.
+    """
+    summary, stale = output / "summary.json", [] if video else [output / "tracked.mp4"]
+    with suppress(OSError, ValueError):
+        if "refined_camera" in json.loads(summary.read_text(encoding="utf-8")):
+            stale.append(output / "camera.yaml")
+    clear_run_folder(output, "slam", stale)
 
 
 def _refined(

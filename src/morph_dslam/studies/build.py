@@ -15,7 +15,7 @@ import numpy as np
 from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.evaluation.model_summary import describe_point
 from morph_dslam.geometry import fit_similarity
-from morph_dslam.io.writing import writing
+from morph_dslam.io.writing import check_no_input, writing
 from morph_dslam.mechanics.spaces import default_order
 from morph_dslam.meshing.mesh_notes import many_cells_note
 from morph_dslam.meshing.mesh_summary import described_mesh, faces_figures
@@ -121,6 +121,8 @@ def build(
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
     described, text = _read(study)
+    read = study_file(study) if isinstance(study, str | Path) else None
+    check_no_input([output], [read, getattr(getattr(described, "mesh", None), "file", None)], StudyError)
     try:
         return _built(described, text, output, workers, executor)
     except StudyError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.errors import StudyError
-from morph_dslam.io.writing import writing
+from morph_dslam.io.writing import check_no_input, writing
 from morph_dslam.meshing.mesh_checks import check_extent
 from morph_dslam.meshing.mesh_notes import small_extent_note
 from morph_dslam.meshing.netgen_meshing import read_surface
@@ -41,6 +41,8 @@ def build_rigid(surface: str | Path, unit: str, output: str | Path | None = None
         this size.
     """
     path, scale = Path(surface), to_si(1.0, unit, "length")
+    if output is not None:
+        check_no_input([Path(output)], [path], StudyError)
     found = read_surface(path)
     extent = scale * np.ptp(found.points, axis=0)
     check_extent(extent, str(path))

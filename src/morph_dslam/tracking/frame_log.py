@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from morph_dslam.errors import TrackingError
-from morph_dslam.io.writing import writing
+from morph_dslam.io.writing import check_no_input, writing
 from morph_dslam.tracking.run_folder import RunFolder
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
@@ -34,11 +34,8 @@ def check_frame_log(path: Path, inputs: Sequence[Path]) -> None:
     """
     if not path.is_file():  # what is there may be a pipe too
         return
+    check_no_input([path], inputs, TrackingError)
     try:
-        if any(given.exists() and given.samefile(path) for given in inputs):
-            raise TrackingError(
-                f"the frame log {path} is an input of this run, and would be emptied: name another file"
-            )
         with path.open("rb") as file:
             first = file.readline(_LONGEST_LINE)
     except OSError as error:

@@ -75,13 +75,14 @@ class RunFolder:
         overwrite: bool = False,
     ) -> None:
         make_run_folder(path, overwrite)
-        clear_run_folder(path)
         self.path, self.name, self.results, self.overwrite = path, name, results, overwrite
         self._camera, self._inner, self._repeated = camera, inner, RepeatedPictures()
         self._centres = InnerCentres(inner)
 
     def __call__(self, tracked: TrackedFrame) -> None:
-        """Take in a frame."""
+        """Take in a frame; from the first one on the run takes the place of an earlier one."""
+        if not len(self.results):
+            clear_run_folder(self.path)
         if tracked.frame.captured is not None:
             self._repeated.add(tracked.frame)
         self.results.add(tracked.frame.index, tracked.frame.timestamp, tracked.results[self.name])

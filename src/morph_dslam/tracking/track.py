@@ -13,12 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.interrupts import WaitingInterrupts
 from morph_dslam.io.camera_doubts import camera_doubts
-from morph_dslam.io.folders import only_writer
+from morph_dslam.io.folders import only_writer, replaced_files
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.io.writing import check_no_input
 from morph_dslam.model.shown_field import Shown
 from morph_dslam.notices import Remark
 from morph_dslam.registration.landmark_binding import bind_landmarks
@@ -130,6 +131,8 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
         As `track` does.
     """
     check_options(run)
+    outputs = [path for folder in run.folders for path in replaced_files(folder)]
+    check_no_input(outputs, run.input_files, TrackingError)
     if run.frame_log is not None:
         check_frame_log(run.frame_log, run.input_files)
     cameras = load_cameras(run)
@@ -240,8 +243,8 @@ class _Job:
             if _checks_camera(part, run)
         }
         named = dict(zip(run.stream_names, self._folders, strict=True))
+        self._streams = self._opened_streams(stack)  # before the log of an earlier run is emptied: it may be refused
         self._log = None if run.frame_log is None else FrameLog(run.frame_log, named)
-        self._streams = self._opened_streams(stack)
         sinks: list[Sink] = [*self._folders, *([] if self._log is None else [self._log])]
         self._video = stack.enter_context(ExitStack())
         screens = self._screens(stack) if run.live else []
