@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -90,9 +91,18 @@ class _Quadratic:
         """By residuals (p, k) with ``weights`` (p,) and their derivatives (p, k, 3) by p displacements."""
         return cls.of_rows(*_curvature(np.ascontiguousarray(rows), residuals, weights), influence)
 
+    @cached_property
+    def _factor(self) -> tuple[Array, bool]:
+        """The Hessian's Cholesky factor, as `cho_solve` takes it."""
+        return cho_factor(self.hessian)
+
     def minimum(self) -> Array:
         """The step (m, 3) that lowers the cost most."""
-        return as_displacements(-cho_solve(cho_factor(self.hessian), self.gradient))
+        return as_displacements(-cho_solve(self._factor, self.gradient))
+
+    def inverse(self) -> Array:
+        """Of the Hessian (3 m, 3 m)."""
+        return np.asarray(cho_solve(self._factor, np.eye(len(self.gradient))), dtype=np.float64)
 
 
 def as_displacements(numbers: Array) -> Array:
@@ -258,8 +268,8 @@ class DiscrepancyFit:
             data = _Quadratic.of_residuals(derivatives @ rotation, residuals, weights, influence)
             cost = self.prior(shape, rotation, values) + data
             values = values + cost.minimum()
-        covariance = cho_solve(cho_factor(cost.hessian), np.eye(values.size))
-        return Discrepancy(self.basis, values, DiscrepancyDeviation(covariance, self._amplitude, self._surface))
+        deviation = DiscrepancyDeviation(cost.inverse(), self._amplitude, self._surface)
+        return Discrepancy(self.basis, values, deviation)
 
     def _influence_on(self, rest: Array) -> Array:
         """The centres' influence (p, m) on points (p, 3), most of which are where they were in the last call."""
