@@ -5,12 +5,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.map_files import map_from_trajectory
 from morph_dslam.slam.rigid_map import Followed
+from morph_dslam.slam.rolling_shutter import velocities
 from morph_dslam.slam.tracking import Tracked, Tracker
 from morph_dslam.sources.frames import Frame
 
@@ -57,6 +59,29 @@ def test_a_readout_time_counts_where_poses_are_given(readout_s):
     depths = found.positions[found.good, 2]
     assert len(depths) > 100
     assert np.sqrt(np.mean((depths - 1.0) ** 2)) < 0.003
+
+
+@pytest.mark.parametrize("hz", [30, 100, 500])
+def test_noise_of_poses_moves_rows_by_no_more_than_itself_however_dense_they_are(hz):
+    """Of a camera that stands still, poses have 0.05 degrees of noise about each axis; 30 ms are read in."""
+    times, noise = np.arange(300) / hz, np.random.default_rng(0).normal(0.0, np.radians(0.05), (300, 3))
+    poses = np.tile(np.eye(4), (300, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(noise).as_matrix()
+    turned = velocities(times, poses, 0.03)[1:-1, :3] * 0.015  # up to the first or last row
+    # Of two poses 60 ms apart, or 67 at 30 Hz, the difference over four, or over four and a half.
+    assert np.sqrt(np.mean(turned**2)) < 1.1 * np.sqrt(2.0) / 4.0 * np.radians(0.05)
+
+
+def test_velocities_by_dense_poses_follow_the_camera():
+    """It swings by 0.1 sin(w t) rad: differences over a time h to either side are sin(w h) / (w h) of the rate."""
+    times, w, h = np.arange(200) / 200.0, 2.0 * np.pi, 0.03
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.outer(0.1 * np.sin(w * times), [0.0, 1.0, 0.0])).as_matrix()
+    found = velocities(times, poses, h)
+    expected = 0.1 * w * np.cos(w * times[10:-10]) * np.sin(w * h) / (w * h)
+    np.testing.assert_allclose(found[10:-10, 1], expected, atol=1e-9)
+    # At the ends, poses are on one side alone.
+    assert found[0, 1] == pytest.approx(0.1 * np.sin(w * h) / h)
 
 
 def test_the_velocity_after_a_camera_was_found_again_is_that_since_then():

@@ -54,7 +54,8 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
     check = PoseCheck(trajectory.world_from_camera, np.asarray(images.camera.intrinsics))
     times, n_posed = [], 0
     poses = trajectory.camera_from_world
-    twists = velocities(trajectory.timestamps, poses)
+    # A motion capture system gives many poses while one image is read out.
+    twists = velocities(trajectory.timestamps, poses, abs(images.camera.readout_s))
     for frame in source:
         times.append(frame.timestamp)
         nearest = int(np.abs(trajectory.timestamps - frame.timestamp).argmin())

@@ -26,26 +26,37 @@ MOST_GAP_S, LEAST_GAP_S = 0.15, 1e-4
 ROUNDS = 3
 
 
-def velocities(timestamps: Array, camera_from_world: Array) -> Array:
-    """Twists (n, 6) of cameras per second, by the frames before and after each.
+def velocities(timestamps: Array, camera_from_world: Array, span_s: float = 0.0) -> Array:
+    """Twists (n, 6) of cameras per second, by the poses before and after each.
 
-    Rotation (rad/s), then translation, from the left: the camera's own axes. NaN where no other frame is near, or all
+    Rotation (rad/s), then translation, from the left: the camera's own axes. NaN where no other pose is near, or all
     have one stamp.
 
     Parameters
     ----------
     timestamps : (n,) seconds, ascending
     camera_from_world : (n, 4, 4)
+    span_s : poses about so much before and after, seconds, where there are closer ones too: over less, errors of the
+        poses become errors of the velocity
     """
-    n = len(timestamps)
+    n, order = len(timestamps), np.arange(len(timestamps))
     result = np.full((n, 6), np.nan)
+    before = np.minimum(_nearest(timestamps, timestamps - span_s), order - 1)
+    after = np.maximum(_nearest(timestamps, timestamps + span_s), order + 1)
     for k in range(n):
-        near = [j for j in (k - 1, k, k + 1) if 0 <= j < n and abs(timestamps[j] - timestamps[k]) < MOST_GAP_S]
+        ends = (int(before[k]), k, int(after[k]))
+        near = [j for j in ends if 0 <= j < n and abs(timestamps[j] - timestamps[k]) < MOST_GAP_S]
         first, last = near[0], near[-1]
         if timestamps[last] - timestamps[first] >= LEAST_GAP_S:
             moved = camera_from_world[last] @ inverse(camera_from_world[first])
             result[k] = twist_of(moved, timestamps[last] - timestamps[first])
     return result
+
+
+def _nearest(timestamps: Array, wanted: Array) -> NDArray[np.int64]:
+    """Numbers (m,) of the stamps (n,), ascending, that are nearest to other ones (m,)."""
+    middles = 0.5 * (timestamps[1:] + timestamps[:-1])
+    return np.searchsorted(middles, wanted)
 
 
 def twist_of(moved: Array, seconds: float) -> Array:
