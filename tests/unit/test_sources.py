@@ -311,6 +311,20 @@ def test_names_that_are_dates_are_times(tmp_path, parts):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("point", ["", "."])
+def test_dates_with_and_without_parts_of_a_second_are_in_the_order_of_time(tmp_path, point):
+    names = ["20240131123059", f"20240131123059{point}500", "20240131123100", f"20240131123100{point}500000"]
+    for number, name in enumerate(names):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), grey(10 * number))
+    frames = list(open_source(tmp_path))
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [0, 10, 20, 30]
+    seconds = [(datetime(2024, 1, 31, 12, 30, 59) - datetime(1970, 1, 1)).total_seconds() + k / 2 for k in range(4)]
+    assert [frame.timestamp for frame in frames] == seconds
+    cv2.imwrite(str(tmp_path / "20240131123100000.png"), grey(0))
+    with pytest.raises(SourceError, match="two images of the same time"):
+        open_source(tmp_path)
+
+
 def test_long_numbers_that_follow_each_other_are_those_of_frames(tmp_path):
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{2026010100000 + number}.png"), grey(1))

@@ -44,8 +44,9 @@ SEVEN_SCENES_FPS = 30.0
 _SECONDS, _PARTS = re.compile(r"\d+\.\d+", re.ASCII), re.compile(r"\d{13,}", re.ASCII)
 #: Parts a second that whole numbers may count: milliseconds, microseconds or nanoseconds.
 _UNITS = (10**3, 10**6, 10**9)
-#: Names that are dates, as 20240131123059800: year, month, day, hour, minute, second, and parts of a second.
-_DATE, _DATE_FORMAT = re.compile(r"((?:19|20)\d{12})(\d{3}|\d{6})?", re.ASCII), "%Y%m%d%H%M%S"
+#: Names that are dates, as 20240131123059800: year, month, day, hour, minute, second, and parts of a second, which some
+#: programs leave out where they are zero.
+_DATE, _DATE_FORMAT = re.compile(r"((?:19|20)\d{12})(?:\.?(\d{3}|\d{6}))?", re.ASCII), "%Y%m%d%H%M%S"
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(png|jpg)")
 
 
@@ -217,13 +218,17 @@ def _timed_images(folder: Path) -> list[tuple[float, Path]]:
     """
     # What is no ending of images is a part of the name.
     names = {path: path.stem if named_kind(path) in IMAGES else path.name for path in image_files(folder)}
+    dates = [_seconds_of_date(name) for name in names.values()]
+    numbers = [date for date in dates if date is not None]
+    is_dated = len(numbers) == len(names)
     kind = next((kind for kind in (_SECONDS, _PARTS) if all(map(kind.fullmatch, names.values()))), None)
-    if kind is None:
-        return []
-    # Decimals are exact; float64 would round nanoseconds.
+    if not is_dated:
+        if kind is None:
+            return []
+        # Decimals are exact; float64 would round nanoseconds.
+        numbers = [Decimal(name) for name in names.values()]
     images: dict[Decimal, Path] = {}
-    for path, name in names.items():
-        time = Decimal(name)
+    for path, time in zip(names, numbers, strict=True):
         if time in images:
             raise SourceError(
                 f"{folder} has two images of the same time, {images[time].name} and {path.name}: keep one of them, or, "
@@ -231,25 +236,20 @@ def _timed_images(folder: Path) -> list[tuple[float, Path]]:
             )
         images[time] = path
     times = sorted(images)
-    if (dated := _of_dates([str(time) for time in times])) is not None:
-        return [(seconds, images[time]) for seconds, time in zip(dated, times, strict=True)]
-    unit = 1 if kind is _SECONDS else _parts_a_second(times)
+    unit = 1 if is_dated or kind is _SECONDS else _parts_a_second(times)
     return [(float(time / unit), images[time]) for time in times] if unit else []
 
 
-def _of_dates(names: Sequence[str]) -> list[float] | None:
-    """Seconds since 1970 of names that are dates, taken to be in UTC; None if not all are."""
-    found = []
-    for name in names:
-        matched = _DATE.fullmatch(name)
-        try:
-            date = datetime.strptime(matched[1], _DATE_FORMAT) if matched else None
-        except ValueError:  # no such month, day or hour
-            date = None
-        if matched is None or date is None:
-            return None
-        found.append(date.replace(tzinfo=UTC).timestamp() + float(f"0.{matched[2] or 0}"))
-    return found
+def _seconds_of_date(name: str) -> Decimal | None:
+    """Seconds since 1970 of a name that is a date, taken to be in UTC; None if it is none."""
+    matched = _DATE.fullmatch(name)
+    try:
+        date = datetime.strptime(matched[1], _DATE_FORMAT) if matched else None
+    except ValueError:  # no such month, day or hour
+        date = None
+    if matched is None or date is None:
+        return None
+    return Decimal(int(date.replace(tzinfo=UTC).timestamp())) + Decimal(f"0.{matched[2] or 0}")
 
 
 def _parts_a_second(times: Sequence[Decimal]) -> int | None:
