@@ -9,6 +9,7 @@ import pytest
 
 from morph_dslam import load_camera, save_model
 from morph_dslam.errors import MorphError, StudioError
+from morph_dslam.extend.mechanics import block, save_mesh
 from morph_dslam.studio import clicks, object_mesh, recording
 from morph_dslam.studio.jobs import Jobs
 from morph_dslam.studio.project import Project
@@ -117,6 +118,13 @@ def test_a_unit_that_is_chosen_later_refuses_no_object(tmp_path):
     (tmp_path / "part.inp").write_bytes(b"garbage")
     with pytest.raises(MorphError):
         object_mesh.check_object(tmp_path / "part.inp", "mm")
+
+
+def test_a_note_on_an_uploaded_object_names_its_file_alone(client, tmp_path):
+    save_mesh(tmp_path / "small.inp", block((0.003, 0.002, 0.002), (2, 2, 2), "hex8"), "mm")
+    assert client.upload("object", "small.inp", (tmp_path / "small.inp").read_bytes()) == 200
+    (note,) = client.call("load_object", file="small.inp", unit="mm")["notes"]
+    assert note.startswith("small.inp measures 3 x 2 x 2 mm")
 
 
 def test_a_name_as_long_as_uploads_may_have_is_loaded(client):

@@ -154,7 +154,7 @@ def small_extent_note(extent: Array, path: Path, unit: str) -> list[str]:
     if np.linalg.norm(extent) >= UNUSUALLY_SMALL:
         return []
     size = described_extent(1e3 * extent)
-    return [f"{path} measures {size} mm; if that is not so, '{unit}' is not the unit it was drawn in"]
+    return [f"{path.name} measures {size} mm; if that is not so, '{unit}' is not the unit it was drawn in"]
 
 
 def many_cells_note(mesh: Mesh) -> list[str]:
