@@ -98,12 +98,13 @@ def test_depth_of_a_recording_is_read_in_its_layout_s_unit_or_the_given_one(tmp_
         list(read_depths(tmp_path, [0], 0.0))
 
 
-def test_depth_that_is_not_registered_to_the_colour_is_refused(tmp_path):
+@pytest.mark.parametrize("values_per_metre", [None, 1000.0, 0.0])
+def test_depth_that_is_not_registered_to_the_colour_is_refused(tmp_path, values_per_metre):
     for number in (0, 1):
         cv2.imwrite(str(tmp_path / f"frame-{number:06d}.color.png"), np.zeros((4, 4, 3), np.uint8))
     cv2.imwrite(str(tmp_path / "frame-000001.depth.png"), np.full((4, 4), 1000, np.uint16))
     with pytest.raises(EvaluationError, match="not registered to the colour camera"):
-        list(read_depths(tmp_path, [0, 1]))
+        list(read_depths(tmp_path, [0, 1], values_per_metre))
 
 
 @pytest.mark.parametrize("n_frames", [3, 40])

@@ -19,7 +19,7 @@ from morph_dslam.evaluation.points import millimetres
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import open_source
-from morph_dslam.sources.frames import DepthScale, has_registered_depth, read_depth
+from morph_dslam.sources.frames import DepthScale, has_depth, has_registered_depth, read_depth
 from morph_dslam.sources.recorded import numbered_images
 from morph_dslam.surface_distances import distances_to_surface
 
@@ -57,7 +57,7 @@ def read_depths(
             yield from _from_file(path, wanted)
         elif not path.is_dir():
             raise EvaluationError(f"there are no depth images at {path}")
-        elif values_per_metre is not None and not has_registered_depth(open_source(path)):
+        elif values_per_metre is not None and not has_depth(open_source(path)):
             yield from _from_folder(path, wanted, values_per_metre)
         else:
             yield from _from_recording(path, wanted, values_per_metre)
@@ -91,22 +91,20 @@ def _from_folder(folder: Path, frames: Sequence[int], scale: float) -> Iterator[
 
 
 def _from_recording(path: Path, frames: Sequence[int], scale: float | None) -> Iterator[tuple[int, DepthImage]]:
-    has_depth, source = False, open_source(path, depth_per_metre=scale)
-    for frame in source:
-        if frame.depth is not None:
-            has_depth = True
-            if not has_registered_depth(source):
-                raise EvaluationError(
-                    f"the depth images of {path} are not registered to the colour camera, so that their pixels show "
-                    "other points: register them first (docs/sources.md)"
-                )
-            if frame.index in frames:
-                yield frame.index, frame.depth
-    if not has_depth:
+    source = open_source(path)
+    if has_depth(source) and not has_registered_depth(source):
+        raise EvaluationError(
+            f"the depth images of {path} are not registered to the colour camera, so that their pixels show "
+            "other points: register them first (docs/sources.md)"
+        )
+    if not has_depth(source):
         raise EvaluationError(
             f"{path} is no recording with depth; if it is a folder of depth images, say how many of their "
             "values make a metre with --depth-per-metre (1000 for millimetres)"
         )
+    for frame in open_source(path, depth_per_metre=scale):
+        if frame.depth is not None and frame.index in frames:
+            yield frame.index, frame.depth
 
 
 #: Depth within this many pixels of the estimated outline may belong to what is behind the object.

@@ -128,6 +128,11 @@ class CheckedSource(CheckedStream):
         return len(self._stream)
 
 
+def has_depth(source: FrameStream) -> bool:
+    """Whether frames come with depth, which belongs to their pixels or not."""
+    return has_registered_depth(source) or bool(getattr(source, "has_depth", False))
+
+
 def has_registered_depth(source: FrameStream) -> bool:
     """Whether frames come with depth that belongs to their pixels."""
     return bool(getattr(source, "has_registered_depth", False))

@@ -102,10 +102,14 @@ class RecordedFrames:
         self._depth_scale = depth_scale
 
     @property
+    def has_depth(self) -> bool:
+        """Whether frames come with depth, though it may not belong to their pixels."""
+        return self._depth_scale is not None and any(record.depth is not None for record in self._records)
+
+    @property
     def has_registered_depth(self) -> bool:
         """Whether frames come with depth that belongs to their pixels."""
-        scale = self._depth_scale
-        return scale is not None and scale.registered and any(r.depth is not None for r in self._records)
+        return self._depth_scale is not None and self._depth_scale.registered and self.has_depth
 
     @property
     def turned_deg(self) -> int:
