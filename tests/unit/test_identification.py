@@ -337,6 +337,10 @@ HEADER = "state,place_x_mm,place_y_mm,place_z_mm,x_mm,y_mm,z_mm\n"
         (HEADER + "one,0,0,0,,,\n", "no point was measured"),
         ("load_N," + HEADER + "1,one,0,0,0,1,1,1\n", "'load_N' is no parameter"),
         ("b_1," + HEADER + ",one,0,0,0,1,1,1\n", "column 'b_1' is empty"),
+        ("x_m," + HEADER + "9,one,0,0,0,1,1,1\n", "x_m and x_mm both hold x"),
+        ("x_mm," + HEADER + "9,one,0,0,0,1,1,1\n", "x_mm and x_mm both hold x"),
+        ("state," + HEADER + "two,one,0,0,0,1,1,1\n", "state and state both hold state"),
+        ("b_1,b_1," + HEADER + "0.5,0.2,one,0,0,0,1,1,1\n", "b_1 and b_1 both hold b"),
         ("b_1,b [1]," + HEADER + "0.5,0.2,one,0,0,0,1,1,1\n", r"b_1 and b \[1\] both hold b"),
     ],
 )

@@ -218,16 +218,11 @@ def load_points(path: str | Path, model: ReducedModel, aligned: bool = False) ->
     Raises
     ------
     IdentificationError
-        If the file is missing, a column is missing or not known, a line is cut short, a value is no number, or a known
-        parameter is outside of its range or has two values in a state.
+        If the file is missing, a column is missing, there twice or not known, a line is cut short, a value is no
+        number, or a known parameter is outside of its range or has two values in a state.
     """
     table = _PointTable(path)
     known = {title: _parameter(path, title, model) for title in table.titles if _name(title) not in OWN}
-    for name in {name for name, _ in known.values()}:
-        if len(twins := [title for title, (other, _) in known.items() if other == name]) > 1:
-            raise IdentificationError(
-                f"{path}: the columns {' and '.join(twins)} both hold {name}: leave one of them in"
-            )
     places, measured = (table.coordinates(names) for names in (PLACE, MEASURED))
     if not np.isfinite(places).all():
         raise IdentificationError(f"{path}: every row needs {', '.join(PLACE)}")
@@ -247,6 +242,11 @@ class _PointTable:
         if missing := [name for name in OWN if name not in names]:
             lacking = ", ".join(name if name == STATE else f"{name}_mm" for name in missing)
             raise IdentificationError(f"{path} has no column {lacking}; its first line must name the columns")
+        for name in filter(None, names):
+            if len(same := [title for title, other in zip(titles, names, strict=True) if other == name]) > 1:
+                raise IdentificationError(
+                    f"{path}: the columns {' and '.join(same)} both hold {name}: leave one of them in"
+                )
         if not rows:
             raise IdentificationError(f"{path} has no points below its titles")
         for line, cells in rows:

@@ -44,8 +44,9 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
     titles = [cell.lower() for cell in rows[0][1]]
     strain = _only(path, titles, [title for title in titles if title in _STRAINS], "stretch or strain")
     stress, true, pascals = _stress_column(path, rows[0][1])
-    time = [i for i, title in enumerate(rows[0][1]) if _splits_into(title, "time")]
-    columns = [titles.index(strain), stress, *time[:1]]
+    times = [title for title in rows[0][1] if _is_time(title)]
+    time = [rows[0][1].index(_only(path, times, times, "time"))] if times else []
+    columns = [titles.index(strain), stress, *time]
     if wide := [line for line, cells in rows[1:] if any(cells[len(titles) :])]:
         raise IdentificationError(
             f"{path}, line {wide[0]}: more cells than the {len(titles)} titles; write decimals with points"
@@ -59,7 +60,7 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
             f"{path}: a {strain} of {values[:, 0].max():g} is more than any rubber stands; name the column "
             "strain_percent if it is in percent"
         )
-    seconds = None if not time else values[:, 2] * _factor(path, rows[0][1][time[0]], "time")
+    seconds = None if not time else values[:, 2] * FACTORS["time"][name_and_unit(times[0])[1].lower()]
     nominal = pascals * values[:, 1] / (stretch if true else 1.0)
     # A file's name may hold bytes that are no text, which cannot be written.
     name = path.name.encode(errors="replace").decode()
@@ -87,6 +88,12 @@ def _stress_column(path: Path, titles: Sequence[str]) -> tuple[int, bool, float]
 
 def _splits_into(title: str, name: str) -> bool:
     return name_and_unit(title)[0].lower() == name
+
+
+def _is_time(title: str) -> bool:
+    """Whether it is one of times with their unit; time_stamp, say, is another column."""
+    unit = name_and_unit(title)[1]
+    return _splits_into(title, "time") and unit.lower() in FACTORS["time"]
 
 
 def _factor(path: Path, title: str, quantity: str) -> float:
