@@ -22,7 +22,12 @@ from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints, load_points
 from morph_dslam.identification.prior import KnownValues
-from morph_dslam.identification.report import identification_lines, summarise
+from morph_dslam.identification.report import (
+    check_no_identification,
+    identification_lines,
+    summarise,
+    write_identification,
+)
 from morph_dslam.identification.values import FACTOR
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
@@ -531,6 +536,14 @@ def test_a_run_whose_frames_contradict_each_other_does_not_count(
     said = capsys.readouterr().out
     assert "does not count: frames contradict each other in c" in said
     assert float(said.splitlines()[-1].split("c=")[1].split()[0]) == pytest.approx(0.6, abs=0.01)
+
+
+def test_what_could_not_be_written_whole_is_no_identification(tmp_path: Path) -> None:
+    table = points_at([0.3] * 3, 0.0)
+    (tmp_path / "identification.png").mkdir()
+    with pytest.raises(IdentificationError):
+        write_identification(tmp_path, identify(table.model, [table], ["a"]))
+    check_no_identification(tmp_path, overwrite=False)
 
 
 def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

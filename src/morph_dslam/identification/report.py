@@ -367,8 +367,9 @@ def write_identification(folder: str | Path, found: Identification) -> dict[str,
     figures = summarise(found)
     with writing(IdentificationError, folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / RESULT).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
         plot(folder / "identification.png", found.misfits)
+        # The last one: by it an identification is known.
+        (folder / RESULT).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return figures
 
 
