@@ -268,6 +268,12 @@ def test_what_pictures_have_told_counts_with_its_deviation() -> None:
     assert both == pytest.approx(alone + std, abs=0.05 * std)
 
 
+@pytest.mark.parametrize("known", [(0.5, 0.0), (0.5, np.nan), (np.inf, 0.1)])
+def test_what_is_known_before_has_a_deviation(known: tuple[float, float]) -> None:
+    with pytest.raises(IdentificationError, match="standard deviation above zero"):
+        KnownValues.independent({"a": (0.3, 0.1), "b": known})
+
+
 def test_known_deviations_stay_without_measurements() -> None:
     known = {"a": (0.3, 0.05), "b": (0.6, 0.1)}
     found = identify(plate(), [], ["a", "b"], prior=KnownValues.independent(known))

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.errors import IdentificationError
+
 Array = NDArray[np.float64]
 #: Nothing is known better than this share of what is known worst, over the standard deviations.
 LEAST_SHARE = 1e-12
@@ -21,12 +23,27 @@ class KnownValues:
     ----------
     names : of k parameters.
     values : (k,) SI.
-    covariance : (k, k) SI.
+    covariance : (k, k) SI, with variances above zero.
+
+    Raises
+    ------
+    IdentificationError
+        If a variance is not above zero, or a number is not finite.
     """
 
     names: tuple[str, ...]
     values: Array
     covariance: Array
+
+    def __post_init__(self) -> None:
+        for name, value, own, row in zip(
+            self.names, self.values, np.diag(self.covariance), self.covariance, strict=True
+        ):
+            if not (own > 0.0 and np.isfinite(value) and np.isfinite(row).all()):
+                raise IdentificationError(
+                    f"what is known of '{name}' before, {value:g} with variance {own:g}, needs a finite value and a "
+                    "standard deviation above zero"
+                )
 
     @classmethod
     def none(cls) -> KnownValues:
