@@ -31,6 +31,7 @@ from morph_dslam.identification.report import (
 from morph_dslam.identification.values import FACTOR
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
+from morph_dslam.model.unknown_loads import UnknownLoads
 from tests.support.run_folders import write_run
 
 #: A plate of 1 m in the plane z = 0; it is shifted by (a, 0, 0) and (0, b c, 0), and turned about x by a small angle d.
@@ -475,6 +476,40 @@ def test_a_run_that_changes_nothing_is_said(
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("note: --run changes nothing here") for line in lines) is not used
     assert lines[-1].startswith(f"{FACTOR}=0.7 std=" if len(asked) == 1 else "b=0.5 std=")
+
+
+def test_forces_of_a_run_with_unknown_loads_have_the_force_of_these(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """100 a newtons along z by the study, 40 by each unit of the load, all 1.3 times as large, and 2 N of offset."""
+    write_run_of_plate(tmp_path / "run")
+    constant = ParameterFunctions(np.zeros(3), np.ones(3), np.zeros((1, 3), int), np.ones((1, 1)))
+    responses = {
+        "displacement": SeparatedField(np.ones((1, 4, 3)), constant),
+        "reaction_force_edge": SeparatedField(np.array([[[0.0, 0.0, 40.0]]]), constant),
+        "compliance_root": SeparatedField(np.ones((1, 1, 1)), constant),
+    }
+    loads = UnknownLoads("", False, np.arange(4), np.ones((4, 3, 1)), np.ones((1, 6)), responses)
+    save_model(tmp_path / "run" / "model.morph", replace(plate(), unknown_loads=loads))
+    coefficients = 0.3 * np.sin(7.0 * STROKES)
+    with h5py.File(tmp_path / "run" / "result.h5", "r+") as file:
+        before = np.asarray(file["parameters"])
+        del file["parameters"]
+        file["parameters"] = np.column_stack([before, coefficients])
+    forces = 1.3 * (100.0 * STROKES + 40.0 * coefficients) + 2.0
+    rows = "".join(f"{frame},{force}\n" for frame, force in enumerate(forces.tolist()))
+    (tmp_path / "curve.csv").write_text(f"frame,force_N\n{rows}")
+    command = ["identify", str(tmp_path / "run" / "model.morph"), "--force", str(tmp_path / "curve.csv")]
+    command += ["--reaction", "edge:z", "--run", str(tmp_path / "run"), "-o", str(tmp_path / "out")]
+    assert cli.main([*command, "--moduli"]) == 0
+    figures = json.loads((tmp_path / "out" / "identification.json").read_text())
+    assert figures["parameters"][0]["value"] == pytest.approx(1.3, rel=1e-6)
+    (of_force,) = figures["measurements"]
+    assert of_force["offset"] == pytest.approx(2.0, abs=1e-4)
+    assert of_force["loading_rate_per_frame"] == pytest.approx({"a_1": 0.1})
+    capsys.readouterr()
+    assert cli.main([*command, "--parameter", "b", "--overwrite"]) == 2
+    assert "identify --moduli alone" in capsys.readouterr().err
 
 
 def values_by(folder: Path, *more: str) -> list[dict[str, Any]]:

@@ -64,6 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
         values_of_run,
         write_identification,
     )
+    from morph_dslam.extend.models import with_unknown_loads
 
     if len(arguments.reaction) != len(arguments.force):
         raise IdentificationError("give one --reaction SET:AXIS for each --force, in the same order")
@@ -71,6 +72,9 @@ def run(arguments: argparse.Namespace) -> None:
     model = load_model(arguments.model)
     folder: Path | None = arguments.run_folder
     tracked = None if folder is None else load_run(folder)
+    if tracked is not None and tracked.model.n_loads and model.unknown_loads is not None and not arguments.parameter:
+        # Forces of one model grow together by a factor of all moduli; a parameter would change what the loads explain.
+        model = with_unknown_loads(model)
     _check_once([(path.resolve(),) for path in arguments.points])
     points = [
         replace(load_points(path, model, arguments.align_points), name=name)

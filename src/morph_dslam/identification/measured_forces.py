@@ -47,7 +47,8 @@ class MeasuredForces:
     Raises
     ------
     IdentificationError
-        If forces by frame have no run, or one with unknown loads that the model does not have; if too few forces are
+        If forces by frame have no run, or one with unknown loads that the model does not have
+        (`model.unknown_loads.with_unknown_loads`); if too few forces are
         left to compare, or several in one place contradict each other.
     """
 
@@ -64,8 +65,8 @@ class MeasuredForces:
             raise IdentificationError("forces by frame need the run that tracked these frames: give --run")
         if self.run is not None and self.are_shown and self.run.model.energy is not None and self.model.energy is None:
             raise IdentificationError(
-                "the run was tracked with --unknown-loads, and forces by frame are compared without such loads: track "
-                "again without --unknown-loads"
+                "the run was tracked with --unknown-loads, and the model has none here: identify --moduli alone, with "
+                "the model of the run, or track again without --unknown-loads"
             )
         if len(self.values) < FEWEST_FORCES:
             raise IdentificationError(
@@ -240,6 +241,6 @@ class MeasuredForces:
         }
         return {
             p.name: rates[p.name]
-            for p in self.run.model.parameters
+            for p in self.run.model.study_parameters
             if abs(rates[p.name]) > LEAST_RATE * (p.upper - p.lower)
         }
