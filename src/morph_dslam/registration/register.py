@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import RegistrationError
-from morph_dslam.geometry import RigidTransform
+from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
@@ -35,6 +35,8 @@ from morph_dslam.registration.mesh_error import mesh_error_factors, mesh_off_sur
 from morph_dslam.registration.messages import OnlyInBox, OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
+    OTHER_MAP_SHIFT,
+    OTHER_MAP_TURN,
     KeyframePose,
     MapRegistration,
     Registration,
@@ -199,10 +201,28 @@ def _guessed(path: Path, scene: Scene) -> GuessedPose:
 
 
 def _camera_poses(scene: Scene) -> dict[int, NDArray[np.float64]]:
-    """camera_from_world (4, 4) by the frames that the map has a pose for."""
-    path = scene.trajectory
-    poses = {int(k): np.linalg.inv(m) for k, m in zip(path.indices, path.world_from_camera, strict=True)}
-    return poses | {keyframe.index: keyframe.camera_from_world for keyframe in scene.keyframes}
+    """camera_from_world (4, 4) by the frames that the map has a pose for.
+
+    Keyframes of a map that was known before have numbers of another recording than the path: a number that stands for
+    two frames names none.
+    """
+    poses = dict(zip(scene.trajectory.indices.tolist(), scene.trajectory.camera_from_world, strict=True))
+    for keyframe in scene.keyframes:
+        other = poses.get(keyframe.index)
+        if other is not None and _is_elsewhere(other, keyframe.camera_from_world, scene.points):
+            del poses[keyframe.index]
+        else:
+            poses[keyframe.index] = keyframe.camera_from_world
+    return poses
+
+
+def _is_elsewhere(one: NDArray[np.float64], other: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
+    """Whether two camera_from_world (4, 4) in a map of points (n, 3) are surely not of one frame."""
+    between = one @ np.linalg.inv(other)
+    ahead = np.linalg.norm(RigidTransform.from_matrix(other).apply(points), axis=1)
+    near = OTHER_MAP_SHIFT * float(np.median(ahead)) if len(points) else 0.0
+    turn = np.linalg.norm(rotation_log(np.ascontiguousarray(between[:3, :3])))
+    return bool(turn > OTHER_MAP_TURN or np.linalg.norm(between[:3, 3]) > near)
 
 
 def _camera_velocities(scene: Scene) -> dict[int, NDArray[np.float64]]:

@@ -309,15 +309,16 @@ def _drop_wrong_depths(rigid_map: RigidMap, keyframe: Keyframe, intrinsics: Arra
     keyframe.right = np.where(wrong, np.nan, keyframe.right)
 
 
-def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory) -> None:
+def correct_map(rigid_map: RigidMap, camera: Camera, trajectory: Trajectory, n_known: int = 0) -> None:
     """Adjust keyframes and points to the middle rows' instants, with the velocities of the camera's path.
 
-    Keyframes whose velocity the path does not tell take no part; they follow where the points have gone.
+    Keyframes whose velocity the path does not tell take no part; they follow where the points have gone. The first
+    ``n_known`` are of another recording, and have velocities of their own.
     """
     rows = {index: row for row, index in enumerate(trajectory.indices.tolist())}
     twists = velocities(trajectory.timestamps, trajectory.camera_from_world)
     kept = rigid_map.kept_keyframes
-    for k in kept:
+    for k in kept[kept >= n_known]:
         keyframe = rigid_map.keyframes[k]
         keyframe.twist = twists[rows[keyframe.index]] if keyframe.index in rows else UNKNOWN_TWIST
     known = np.array([np.isfinite(rigid_map.keyframes[k].twist).all() for k in kept], dtype=bool)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -281,9 +282,16 @@ def map_from_colmap(model: ColmapModel, source: FrameSource, images: FrameImages
 
     A frame is an image if its number is the last one in the image's name. Lengths are the model's.
 
-    Raises MapError if none of the frames is an image of the model, or its points are not where the camera has them.
+    Raises MapError if none of the frames is an image of the model, two images have one number, or its points are not
+    where the camera has them.
     """
     wanted = {image.number: image for image in model.images}
+    if len(wanted) < len(model.images):
+        one, other = next(pair for pair in pairwise(model.images) if pair[0].number == pair[1].number)
+        raise MapError(
+            f"images of the COLMAP model have one number, {one.name} and {other.name}: a frame is an image by the last "
+            "number in its name, so leave only the images of one recording in images.txt"
+        )
     rigid_map, errors, numbers = RigidMap(), [], []
     nowhere = np.zeros((len(model.points), 2))
     rigid_map.add_points(model.points, nowhere, 0, GOOD)

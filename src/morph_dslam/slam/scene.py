@@ -267,12 +267,14 @@ def start_slam(
     slam = Slam(camera, options, with_depth, threaded=isinstance(source, LiveStream))
     if isinstance(known, Scene):
         slam.use_map(known.map)
+        slam.is_of_other_recording = True
     elif known is not None:
         images = images or (source if isinstance(source, FrameSource) else None)
         if images is None:
             raise SourceError(f"{source.name} is live: give the recording that the poses are of")
         make = map_from_trajectory if isinstance(known, Trajectory) else map_from_colmap
         slam.use_map(make(known, images, slam.frame_images))  # type: ignore[arg-type]
+        slam.is_of_other_recording = images.name != source.name
     return slam
 
 
@@ -306,9 +308,18 @@ def finish_scene(slam: Slam, frames: Sequence[SlamFrame], recording: FrameSource
     frames = frames if recording is None else find_rest(slam, frames, recording)
     trajectory = trajectory_of(slam, frames)
     for _ in range(rolling_shutter.ROUNDS if slam.camera.readout_s and not slam.is_frozen else 0):
-        correct_map(slam.map, slam.camera, trajectory)
+        correct_map(slam.map, slam.camera, trajectory, slam.n_known if slam.is_of_other_recording else 0)
         trajectory = trajectory_of(slam, frames)
+    if slam.is_of_other_recording and not slam.is_frozen:
+        _number_apart(slam, frames)
     return Scene(slam.camera, slam.map, trajectory, tuple(frames), slam)
+
+
+def _number_apart(slam: Slam, frames: Sequence[SlamFrame]) -> None:
+    """Add a power of ten to the known keyframes' numbers, so that no frame of the recording has one of them."""
+    taken = max((frame.index for frame in frames), default=0)
+    for keyframe in slam.map.keyframes[: slam.n_known]:
+        keyframe.index += 10 ** len(str(taken))
 
 
 def trajectory_of(slam: Slam, frames: Sequence[SlamFrame]) -> Trajectory:

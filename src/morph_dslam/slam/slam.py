@@ -61,6 +61,7 @@ class Slam:
     is_frozen : whether the map is kept as it is
     frozen_at : frame from which on it froze because the scene deformed, or None
     n_known : keyframes of a map that was known before
+    is_of_other_recording : whether these have the numbers of another recording's frames
     n_depths_aside : depth images that were not used because they do not belong to the colour pixels
     depth_ratio : measured depths over those of a map that was known before, once a frame told; None before
     seen_in_known_map : points of the first frames in a map that was known before and is kept, by the frames' numbers:
@@ -81,7 +82,7 @@ class Slam:
         self.newest_view: FrameView | None = None
         self.is_frozen, self.frozen_at = False, None
         self.n_restarts, self.threaded = 0, threaded
-        self.n_known, self.n_depths_aside = 0, 0
+        self.n_known, self.n_depths_aside, self.is_of_other_recording = 0, 0, False
         self.depth_ratio: float | None = None
         self.seen_in_known_map: dict[int, Followed] = {}
         self.astray_in_known_map: dict[int, Followed] = {}
@@ -120,7 +121,7 @@ class Slam:
 
     def _restart(self) -> None:
         self.n_restarts += 1
-        self.n_known = 0
+        self.n_known, self.is_of_other_recording = 0, False
         self._begin(RigidMap(self.frame_images.baseline_px))
 
     def finder(self) -> Slam:

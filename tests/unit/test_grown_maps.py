@@ -1,0 +1,92 @@
+"""Maps that were known before a recording: their keyframes belong to another one."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.camera import Camera
+from morph_dslam.errors import MapError, RegistrationError
+from morph_dslam.io.colmap import ColmapImage, ColmapModel
+from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.registration.register import register
+from morph_dslam.slam.frame_images import FrameImages
+from morph_dslam.slam.local_map import correct_map
+from morph_dslam.slam.map_files import map_from_colmap
+from morph_dslam.slam.options import SlamOptions
+from morph_dslam.slam.result import SlamFrame, SlamStatus
+from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
+from morph_dslam.slam.rolling_shutter import after, row_times
+from morph_dslam.slam.scene import Scene, finish_scene, start_slam
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.rendered_room import Film
+
+CAMERA = Camera(640, 480, 500, 500, 319.5, 239.5)
+ROLLING = Camera(640, 480, 500, 500, 319.5, 239.5, readout_s=0.03)
+RNG = np.random.default_rng(0)
+POINTS = np.column_stack([RNG.uniform(-1, 1, 120), RNG.uniform(-0.8, 0.8, 120), RNG.uniform(2, 4, 120)])
+NO_PATH = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+
+
+def at(x):
+    """camera_from_world of a camera that is ``x`` metres to the right."""
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return pose
+
+
+def keyframe(index, x, speed=0.0):
+    """What a camera that moves to the right by ``speed`` (m/s) sees, row after row."""
+    twist, local = np.array([0, 0, 0, -speed, 0, 0]), POINTS - [x, 0, 0]
+    pixels = CAMERA.project(local)
+    for _ in range(10):
+        seconds = ROLLING.readout_s * row_times(pixels[:, 1], ROLLING)
+        pixels = CAMERA.project(after(local, np.broadcast_to(twist, (len(local), 6)), seconds))
+    image = np.zeros((480, 640), np.uint8)
+    return Keyframe(index, index / 30, image, at(x), np.arange(len(POINTS)), pixels, twist=twist.astype(float))
+
+
+def map_of(*keyframes):
+    rigid_map = RigidMap()
+    rigid_map.add_points(POINTS.copy(), np.zeros((len(POINTS), 2)), 0, GOOD)
+    for each in keyframes:
+        rigid_map.add_keyframe(each)
+    return rigid_map
+
+
+@pytest.mark.parametrize("first", [0, 1000])
+def test_keyframes_of_a_known_map_keep_their_velocity_where_it_grows(first):
+    """Whether frames of the new recording, which goes the other way, have their numbers or not."""
+    known = [keyframe(first + 10 * k, 0.1 * k, 1.0) for k in range(4)]
+    path = 0.3 - 1.5 * np.arange(41) / 30
+    rigid_map = map_of(*known, *(keyframe(k, path[k], -1.5) for k in (5, 15, 25)))
+    before = [each.camera_from_world.copy() for each in rigid_map.keyframes]
+    poses = np.linalg.inv(np.array([at(x) for x in path]))
+    correct_map(rigid_map, ROLLING, Trajectory(np.arange(41) / 30, poses, np.arange(41)), n_known=len(known))
+    assert [each.twist[3] for each in rigid_map.keyframes[:4]] == [-1.0] * 4
+    # Everything was exact, and stays so.
+    assert np.abs(rigid_map.positions - POINTS).max() < 1e-4
+    moved = [each.camera_from_world - old for each, old in zip(rigid_map.keyframes, before, strict=True)]
+    assert np.abs(moved).max() < 1e-4
+
+
+def test_a_map_that_grew_has_one_keyframe_of_each_number():
+    known = Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH)
+    slam = start_slam(Film([]), CAMERA, SlamOptions(extend=True), known)
+    slam.map.add_keyframe(keyframe(20, 0.4))
+    scene = finish_scene(slam, [SlamFrame(k, k / 30, SlamStatus.LOST) for k in range(90, 120)])
+    assert [each.index for each in scene.keyframes] == [1000, 1020, 20]
+
+
+def test_landmarks_in_a_number_of_two_recordings_are_refused():
+    rigid_map = map_of(keyframe(0, 0.0), keyframe(20, 0.2))
+    path = Trajectory(np.arange(3.0), np.linalg.inv(np.array([at(x) for x in (0.0, 0.1, 1.5)])), np.array([0, 10, 20]))
+    nodes = bent_sheet_model(8, 6).nodes
+    clicks = Landmarks(nodes[:3], np.array([[100.0, 100], [200, 100], [100, 200]]), np.full(3, 20))
+    with pytest.raises(RegistrationError, match=r"frame 20 has no pose in the map.* frame 10"):
+        register(Scene(CAMERA, rigid_map, path), bent_sheet_model(8, 6), landmarks=clicks)
+
+
+def test_a_model_of_two_images_with_one_number_is_refused():
+    images = [ColmapImage(f"{side}/0001.png", np.eye(4), np.arange(3), np.zeros((3, 2))) for side in ("left", "right")]
+    with pytest.raises(MapError, match=r"left/0001\.png and right/0001\.png"):
+        map_from_colmap(ColmapModel(images, POINTS[:3]), Film([]), FrameImages(CAMERA))
