@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
+from morph_dslam.slam.loop_closing import Similarities, spread
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.mapping import ENOUGH_KEYFRAMES, MOST_AT_ONCE, RECENT, cull_keyframes
 from morph_dslam.slam.rigid_map import CANDIDATE, GOOD, REMOVED, Followed, Keyframe, RigidMap
@@ -143,6 +144,20 @@ def test_a_keyframe_that_was_taken_out_moves_with_those_that_stand_for_it():
     moved = pose((0.0, 2.0, 1.0), (0.1, 0.0, 0.3))
     rigid_map.keyframes[3].camera_from_world = rigid_map.keyframes[3].camera_from_world @ moved
     assert rigid_map.pose_of(2) == pytest.approx(before @ moved)
+
+
+def test_a_keyframe_that_was_taken_out_moves_with_the_scale_around_those_that_stand_for_it():
+    """A loop shrinks the whole map about the first camera: all cameras are as much nearer to it."""
+    rigid_map = map_of(*[[0, 1, 2]] * 4)
+    for k, keyframe in enumerate(rigid_map.keyframes):
+        keyframe.camera_from_world = pose((0.2 * k, -0.1 * k, 0.0), (0.0, 0.1 * k, 0.0))
+    rigid_map.remove_keyframe(2, carrier=1)
+    rigid_map.remove_keyframe(1, carrier=3)
+    shrunk = rigid_map.pose_of(2)
+    shrunk[:3, 3] *= 0.8
+    before = Similarities.of_poses(np.array([keyframe.camera_from_world for keyframe in rigid_map.keyframes]))
+    spread(rigid_map, before, Similarities(np.full(4, 0.8), before.rotations, 0.8 * before.translations))
+    assert rigid_map.pose_of(2) == pytest.approx(shrunk)
 
 
 def test_a_map_grows_with_the_scene_and_not_with_time():

@@ -166,6 +166,23 @@ class Loop:
     pairs: Indices
 
 
+def spread(rigid_map: RigidMap, before: Similarities, after: Similarities) -> None:
+    """Move all keyframes of a map from where they were, and points with the keyframes that saw them.
+
+    Where the scale around a keyframe changes, so does how far from it those are that it stands for.
+    """
+    owners = rigid_map.template_keyframe
+    moved = after[owners] @ before[owners].inverse
+    rigid_map.positions[:] = moved.apply(rigid_map.positions)
+    grown = after.scales / before.scales
+    for keyframe, pose in zip(rigid_map.keyframes, after.camera_from_world(), strict=True):
+        keyframe.camera_from_world = pose
+        if keyframe.carrier >= 0:
+            # A new array: copies of the map may have the same.
+            keyframe.from_carrier = keyframe.from_carrier.copy()
+            keyframe.from_carrier[:3, 3] *= grown[keyframe.carrier]
+
+
 class LoopCloser:
     """Finds and closes loops.
 
@@ -211,7 +228,7 @@ class LoopCloser:
         before = Similarities.of_poses(np.array([k.camera_from_world for k in self._map.keyframes]))
         edges, measured = self._pose_graph(loop, before)
         after = optimise(before, edges, measured, with_scale=not self._map.is_metric)
-        self._spread(before, after)
+        spread(self._map, before, after)
         self._join(loop)
         self._mapper.adjust_all()
         self.n_closed += 1
@@ -266,14 +283,6 @@ class LoopCloser:
             np.concatenate([measured.translations, held.translations]),
         )
         return edges, measured
-
-    def _spread(self, before: Similarities, after: Similarities) -> None:
-        """Move keyframes, and points with the keyframes that saw them."""
-        owners = self._map.template_keyframe
-        moved = after[owners] @ before[owners].inverse
-        self._map.positions[:] = moved.apply(self._map.positions)
-        for keyframe, pose in zip(self._map.keyframes, after.camera_from_world(), strict=True):
-            keyframe.camera_from_world = pose
 
     def _edges(self) -> Indices:
         """Pairs of keyframes that follow each other, or see many of the same points."""
