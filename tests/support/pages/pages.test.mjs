@@ -7,7 +7,9 @@ import { properName } from './server.js';
 import { ImageView, colourBar } from './overlay.js';
 import { LiveCamera } from './live_camera.js';
 import { recordButton } from './recorder.js';
+import { resultsStep } from './results_step.js';
 import { scanStart } from './scan_start.js';
+import { SolidView } from './solid_view.js';
 import { startStep } from './start_step.js';
 import { studyStep } from './study_step.js';
 
@@ -211,6 +213,41 @@ test('a scan that is left while its frame comes says nothing in the next step', 
 });
 
 // -- the image --------------------------------------------------------------------------------------
+
+// -- the results ------------------------------------------------------------------------------------
+
+async function results(frame) {
+  const app = stepApp({ done: { track: true }, notes: {}, files: [] });
+  const row = { frame: 0, status: 'tracked', parameters: {}, forces: {}, largest_displacement: null, largest_von_mises: null };
+  serve({
+    model_mesh: () => packed({}, [['nodes', '<f4', [0, 0, 0]], ['triangles', '<i4', [0, 0, 0]]]),
+    model: () => ({ parameters: [], supports: [] }),
+    'model.json': () => ({ colours: Array(256).fill([1, 2, 3]), fields: [{ key: 'displacement', top: 1 }] }),
+    tracked_frames: () => ({ frames: [row], summary: { n_tracked: 1, n_frames: 1, median_ms: 1 } }),
+    overlay: () => packed({ top: 1, unit: 'MPa' }, [['pixels', '<f4', [0, 0]], ['order', '<i4', []], ['values', '<f4', [0]],
+      ['displacement', '<f4', [0, 0, 0]]]),
+    frame,
+  });
+  return { app, step: await resultsStep(app), solid: SolidView.all.at(-1) };
+}
+
+test('the results show the surface of a frame', async () => {
+  const { app, solid } = await results(() => ({}));
+  await wait();
+  assert.deepEqual(app.refused, []);
+  assert.equal(solid.shown, 1);
+});
+
+test('results that are left while a frame comes show nothing, and say nothing in the next step', async () => {
+  for (const answer of [{}, 'the recording has gone']) {
+    const { app, step, solid } = await results(async () => { await wait(20); return answer; });
+    step.close();
+    await wait(40);
+    assert.equal(solid.isGone, true);
+    assert.equal(solid.shown, 0);
+    assert.deepEqual(app.refused, []);
+  }
+});
 
 test('the first button alone sets points, and a drag that the system ends is over', async () => {
   const clicked = [];

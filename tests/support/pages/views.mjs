@@ -10,4 +10,14 @@ export class MeshView {
   dispose() { this.isGone = true; }
 }
 
-export class SolidView extends MeshView {}
+export class SolidView extends MeshView {
+  static all = [];
+
+  constructor() {
+    super();
+    Object.assign(this, { renderer: { setClearColor() {} }, shown: 0 });
+    SolidView.all.push(this);
+  }
+
+  show() { this.shown += 1; }
+}

@@ -78,7 +78,7 @@ export async function resultsStep(app) {
   ]));
   show();
   return {
-    close: () => solid.dispose(),
+    close: () => { picture.close(); solid.dispose(); },
     job: (job, ended) => {
       if (!ended || job.kind !== 'export' || job.status !== 0) return;
       const format = job.command.match(/--format (\w+)/)[1];

@@ -11,7 +11,13 @@ const MOST_PLOTTED = 600; // frames of a live run
 // The picture of a frame with the model over it; of: the run in its folder, or the log of what is being tracked.
 export class RunPicture {
   constructor(container, mesh, colours, of = 'run') {
-    Object.assign(this, { container, mesh, colours, of, view: new ImageView(container), busy: false, wanted: null });
+    Object.assign(this, { container, mesh, colours, of, view: new ImageView(container), busy: false, wanted: null, isClosed: false });
+  }
+
+  // What comes later is not shown: the step is left.
+  close() {
+    this.isClosed = true;
+    this.wanted = null;
   }
 
   // Shows the frame that was asked for last; ones in between are left out.
@@ -25,6 +31,10 @@ export class RunPicture {
         this.wanted = null;
         const tracked = next.status === 'tracked';
         const [image, overlay] = await Promise.all([frame(next.frame), tracked ? call('overlay', { frame: next.frame, of: this.of }) : null]);
+        if (this.isClosed) {
+          image.close?.();
+          return;
+        }
         this.view.setOverlay(overlay, this.mesh.triangles, this.colours);
         this.view.setImage(image);
         this.container.parentElement.querySelector('.bar')?.remove();
@@ -32,6 +42,8 @@ export class RunPicture {
         this.container.dataset.frame = next.frame;
         shown(next, overlay);
       }
+    } catch (error) {
+      if (!this.isClosed) throw error;
     } finally {
       this.busy = false;
     }
@@ -108,5 +120,5 @@ export async function trackStep(app) {
 
   drawJob(app.state.job);
   drawFrames(app.run.frames);
-  return { job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
+  return { close: () => shown.close(), job: drawJob, frames: (frames) => { drawFrames(frames); drawJob(app.state.job); } };
 }
