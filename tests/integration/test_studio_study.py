@@ -112,6 +112,21 @@ def test_remarks_and_order_stay():
     assert "# as measured" in changed_text(INLINE, "materials", "rubber", rubber)
 
 
+@pytest.mark.parametrize(
+    ("text", "section", "key"),
+    [
+        ("materials = 3\n", "materials", "rubber"),
+        ("[[materials]]\nlaw = 'x'\n", "materials", "rubber"),
+        ("supports = 3\n", "supports", 0),
+        ("[supports]\nkind = 'x'\n", "supports", 0),
+    ],
+)
+def test_a_section_of_another_kind_is_changed_in_the_text_alone(text, section, key):
+    for value in ({"kind": "fixed"}, None):
+        with pytest.raises(StudioError, match="change the text"):
+            changed_text(text, section, key, value)
+
+
 @pytest.mark.parametrize("number", ["inf", "-inf", "nan"])
 def test_numbers_that_are_not_finite_are_refused(number, tmp_path):
     text = f"{PLAIN}\n[parameters.p]\nrange = [0.0, {number}]\n"

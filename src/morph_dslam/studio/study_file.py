@@ -30,6 +30,8 @@ LONGEST_TEXT = 500_000
 _NAMED, _LISTED, _SINGLE = ("materials", "parameters"), ("supports", "loads", "couplings", "contacts"), (
     "sampling", "reduction", "solver", "mesh", "name",
 )  # fmt: skip
+#: Why a form leaves a section alone.
+_BY_HAND = "a form cannot change {} as it is written here: change the text"
 
 
 def check_text(text: str) -> dict[str, Any]:
@@ -120,6 +122,9 @@ def changed_text(text: str, section: str, key: str | int | None, value: Any) -> 
     """
     content = check_text(text)
     document = tomlkit.parse(text)
+    kind = dict if section in _NAMED else list if section in _LISTED else object
+    if section in content and not isinstance(content[section], kind):
+        raise StudioError(_BY_HAND.format(section))
     if section in _NAMED and isinstance(key, str):
         wanted = content | {section: _without_none(content.get(section, {}) | {key: value})}
         change = _change_named
@@ -143,7 +148,7 @@ def changed_text(text: str, section: str, key: str | int | None, value: Any) -> 
     except (TOMLKitError, ValueError, TypeError, LookupError, AttributeError):
         is_right, changed = False, ""
     if not is_right:
-        raise StudioError(f"a form cannot change {section} as it is written here: change the text")
+        raise StudioError(_BY_HAND.format(section))
     return changed
 
 
