@@ -86,7 +86,7 @@ def plot_pixel_errors_by_frame(path: Path, error: PixelError) -> None:
     """The spread of the pixel error over the tracks of each frame."""
     distances = [row[np.isfinite(row)] for row in error.distances_px]
     across = 1e3 * error.across[np.isfinite(error.across)]
-    title = f"across the sight line: mean {across.mean():.3f} mm, 95th percentile {np.percentile(across, 95):.3f} mm"
+    title = f"across the line of sight: mean {across.mean():.3f} mm, 95th percentile {np.percentile(across, 95):.3f} mm"
     _plot_by_frame(path, error.frames, distances, distances, "pixel error [px]", title, unit="px")
 
 
@@ -157,11 +157,11 @@ def plot_error_map(path: Path, error: MaterialError, model: ReducedModel) -> Non
 
 
 def plot_pixel_error_map(path: Path, error: PixelError, model: ReducedModel) -> None:
-    """Mean error across the sight line of each track where its point lies on the undeformed object."""
+    """Mean error across the line of sight of each track where its point lies on the undeformed object."""
     measured = np.isfinite(error.across).any(axis=0)
     rest = model.rest_positions(error.points)[measured]
     _plot_map(
-        path, rest, np.nanmean(error.across[:, measured], axis=0), model, "mean error across\nthe sight line [mm]"
+        path, rest, np.nanmean(error.across[:, measured], axis=0), model, "mean error across\nthe line of sight [mm]"
     )
 
 
@@ -222,8 +222,8 @@ def _error_section(folder: Path, figures: Mapping[str, Any]) -> Section:
         "median": f"{figures['median_mm']:.3f} mm",
         "95th percentile": f"{figures['p95_mm']:.3f} mm",
         "largest": f"{figures['max_mm']:.3f} mm",
-        "mean along the sight line": f"{figures['mean_along_sight_mm']:.3f} mm",
-        "mean across the sight line": f"{figures['mean_across_sight_mm']:.3f} mm",
+        "mean along the line of sight": f"{figures['mean_along_sight_mm']:.3f} mm",
+        "mean across the line of sight": f"{figures['mean_across_sight_mm']:.3f} mm",
         "mean after one rigid motion of the truth": f"{figures['after_one_rigid_motion']['mean_mm']:.3f} mm",
         "mean after one in each frame": f"{figures['after_one_in_each_frame']['mean_mm']:.3f} mm",
         "points compared": f"{figures['n_points_bound']} of {figures['n_points']}",
@@ -242,7 +242,7 @@ def _error_section(folder: Path, figures: Mapping[str, Any]) -> Section:
 def _pixel_section(folder: Path, figures: Mapping[str, Any]) -> Section:
     names = {"mean": "mean", "median": "median", "p95": "95th percentile", "max": "largest"}
     rows = {
-        name: f"{figures[f'{key}_px']:.3f} px, {figures[f'{key}_mm']:.4f} mm across the sight line"
+        name: f"{figures[f'{key}_px']:.3f} px, {figures[f'{key}_mm']:.4f} mm across the line of sight"
         for key, name in names.items()
     }
     rows["mean shift to the right and down"] = ", ".join(f"{shift:.3f} px" for shift in figures["mean_shift_px"])
@@ -255,7 +255,7 @@ def _pixel_section(folder: Path, figures: Mapping[str, Any]) -> Section:
     ]
     captions = {
         "pixel_evaluation.png": "Pixel error over the tracks of each frame.",
-        "pixel_error_map.png": "Mean error across the sight line where each track lies on the undeformed object.",
+        "pixel_error_map.png": "Mean error across the line of sight where each track lies on the undeformed object.",
     }
     table = Table(worst, ("largest errors: track", "mean px", "largest px", "mean mm", "frames"))
     blocks = [Table.of(rows), *_warnings(pixel_remarks(figures)), *_pictures(folder, captions), table]
