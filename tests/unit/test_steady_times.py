@@ -45,6 +45,45 @@ def test_another_rate_is_followed() -> None:
     assert np.std(np.diff(found)[-100:] - 1.0 / 24.0) < 1.5e-3
 
 
+def every(kept: tuple[int, ...], of: int) -> np.ndarray:
+    """Times of those frames at 30 a second whose number, modulo ``of``, is kept."""
+    numbers = np.arange(1500)
+    return numbers[np.isin(numbers % of, kept)] / 30.0
+
+
+def at_rates(before: float, after: float) -> np.ndarray:
+    return np.concatenate([np.arange(200) / before, 200 / before + np.arange(200) / after])
+
+
+UNEVEN = {
+    **{f"{share:.0%} dropped": share for share in (0.1, 0.3, 0.5)},
+    **{f"{kept} of {of}": every(kept, of) for kept, of in (((0, 1), 3), ((0, 1, 3), 5), ((0, 2), 5), ((0,), 2))},
+    **{f"{b} to {a} fps": at_rates(b, a) for b, a in ((30, 10), (10, 30), (30, 20), (30, 24), (25, 20), (15, 30))},
+    "a gap of 5 s": np.arange(400) / 30.0 + np.where(np.arange(400) > 200, 5.013, 0.0),
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("what", UNEVEN)
+def test_times_are_not_worse_than_those_at_which_frames_are_received(what: str, seed: int) -> None:
+    """Delays of 0 to 4 ms. Where frames were dropped or the rate changed times were off by up to 166 ms."""
+    rng, true = np.random.default_rng(seed), UNEVEN[what]
+    if isinstance(true, float):
+        true = (np.arange(1500) / 30.0)[rng.random(1500) > true]
+    received = true + rng.uniform(0.0, 4e-3, len(true))
+    before, after = received - true, smoothed(received) - true
+    assert np.std(after) < 1.1 * np.std(before)
+    assert np.std(np.diff(after)) < 1.1 * np.std(np.diff(before))
+    assert np.abs(after - 2e-3).max() < np.abs(before - 2e-3).max() + 3e-3
+
+
+@pytest.mark.parametrize("delay", [2e-3, 5e-3, 20e-3])
+def test_nor_where_delays_have_a_long_tail(delay: float) -> None:
+    rng, true = np.random.default_rng(1), np.arange(1000) / 30.0
+    received = np.maximum.accumulate(true + rng.exponential(delay, len(true)))
+    assert np.std(smoothed(received) - true) < 1.1 * np.std(received - true)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_frame_that_is_late_by_most_of_an_interval_is_not_the_next_but_one(seed: int) -> None:
     """22 ms of 33: such frames were given a time a whole interval late, and the next one the same time."""
@@ -53,11 +92,10 @@ def test_a_frame_that_is_late_by_most_of_an_interval_is_not_the_next_but_one(see
     late = rng.choice(np.arange(50, len(true)), 15, replace=False)
     received[late] += 22e-3
     found = smoothed(received)
-    steps = np.diff(found)
-    # Nearer to the truth than they were received, and no frame has the time of another.
-    assert np.abs(found - true)[late].mean() < 0.5 * (received - true)[late].mean()
-    assert np.std(found - true) < 0.5 * np.std(received - true)
-    assert steps.min() > 0.0
+    # No later than they were received, and no frame has the time of another.
+    assert (found - received)[late].max() <= 6e-3
+    assert np.std(found - true) < np.std(received - true)
+    assert np.diff(found).min() > 3e-3
 
 
 def test_times_never_run_backwards() -> None:

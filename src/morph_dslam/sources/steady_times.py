@@ -8,13 +8,11 @@ import numpy as np
 
 #: Frames that tell the times of the newest one.
 REMEMBERED = 30
-#: A frame farther from where the others have it, as a share of the interval, does not tell times with them.
-MOST_OFF = 0.5
-#: So many of these in a row begin anew: the rate has changed.
+#: A frame farther from where the others have it, in seconds or as a share of the interval, does not tell times with
+#: them: it is late, or the rate has changed.
+MOST_OFF_S, MOST_OFF = 6e-3, 0.4
+#: So many of these in a row begin anew.
 BEGIN_ANEW = 2
-#: How much earlier than the others, as a share of the interval, a frame may come at least; and as a multiple of what
-#: these had.
-LEAST_EARLY, TIMES_EARLIER = 0.2, 1.5
 #: Times are apart by this share of the interval at least; by so many seconds where that is not known.
 LEAST_STEP, LEAST_SECONDS = 0.1, 1e-6
 
@@ -24,17 +22,15 @@ class SteadyTimes:
 
     A camera records in even intervals, but a frame is received some milliseconds late, now more and now less, and a
     velocity from two frames would have that as an error. The time of a frame is that of the line that fits the last
-    `REMEMBERED` ones best. Where frames are dropped it counts on by as many. A frame comes late, but never long before
-    the others would have it: what would, had one been dropped, is itself late. One that is off by more than half of an
-    interval has the time of the line, and does not count for it unless the next one is off too. Times increase.
+    `REMEMBERED` ones best, which counts on where frames are dropped. A frame that is not near the line has the time at
+    which it was received, and so have those after it until a line holds again: no time is moved by more than
+    `MOST_OFF_S`. Times increase.
     """
 
     def __init__(self) -> None:
         # Pairs of a frame's number and when it was received: those of the line, and those in a row that are off it.
         self._on_line: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
-        self._off_line: list[tuple[int, float]] = []
-        self._received: deque[float] = deque(maxlen=REMEMBERED)
-        self._number = 0
+        self._off_line: list[float] = []
         self._last = -np.inf
 
     def add(self, received: float) -> float:
@@ -45,50 +41,28 @@ class SteadyTimes:
 
     def _smoothed(self, received: float) -> tuple[float, float]:
         """The time of the next frame, and the interval; that is 0 where it is not known yet."""
-        offset, slope, early = self._line()
-        before = offset + slope * self._number if self._off_line else self._received[-1] if self._received else received
-        self._received.append(received)
-        interval = float(np.median(np.diff(self._received))) if len(self._received) > 1 else 0.0
-        steps = max(round((received - before) / interval), 1) if interval > 0.0 else 1
-        if steps > 1 and slope > 0.0 and offset + slope * (self._number + steps) - received > early * slope:
-            steps -= 1  # no frame comes so early: it is late, and none was dropped
-        if slope <= 0.0:
-            self._number += steps
-            self._on_line.append((self._number, received))
+        offset, interval = self._line()
+        number = self._on_line[-1][0] if self._on_line else 0
+        if interval <= 0.0:
+            self._on_line.append((number + 1, received))
+            return received, 0.0
+        number += max(round((received - offset) / interval - number), 1)
+        near = min(MOST_OFF_S, MOST_OFF * interval)
+        if abs(received - offset - interval * number) > near:
+            self._off_line.append(received)
+            if len(self._off_line) >= BEGIN_ANEW:
+                self._on_line, self._off_line = deque(enumerate(self._off_line), REMEMBERED), []
             return received, interval
-        if received - offset - slope * (self._number + steps) < -MOST_OFF * slope and self._counted_too_far():
-            self._on_line.pop()  # it was late by a whole interval, and no frame was dropped
-            self._number -= 1
-        self._number += steps
-        if abs(received - offset - slope * self._number) <= MOST_OFF * slope:
-            self._off_line.clear()
-            self._on_line.append((self._number, received))
-            offset, slope, _ = self._line()
-            return offset + slope * self._number, interval
-        self._off_line.append((self._number, received))
-        if len(self._off_line) < BEGIN_ANEW:
-            return offset + slope * self._number, interval
-        self._on_line, self._off_line = deque(self._off_line, REMEMBERED), []
-        return received, interval
+        self._off_line.clear()
+        self._on_line.append((number, received))
+        offset, interval = self._line()
+        return offset + interval * number, interval
 
-    def _counted_too_far(self) -> bool:
-        """Whether frames before the last one were taken to be dropped."""
-        if len(self._on_line) <= BEGIN_ANEW or self._on_line[-1][0] != self._number:
-            return False
-        return self._number - self._on_line[-2][0] > 1
-
-    def _line(self) -> tuple[float, float, float]:
-        """The time of number 0 on the line, the interval, and how early frames may come, as a share of that.
-
-        The interval is 0 where too few are known.
-        """
-        if len(self._on_line) < 3:
-            return 0.0, 0.0, MOST_OFF
+    def _line(self) -> tuple[float, float]:
+        """The time of number 0 on the line, and the interval; 0 where that is not known."""
+        if len(self._on_line) < 2:
+            return 0.0, 0.0
         numbers, received = np.array(self._on_line).T
         away = numbers - numbers.mean()
         interval = float(away @ (received - received.mean()) / (away @ away))
-        offset = float(received.mean() - interval * numbers.mean())
-        if interval <= 0.0:
-            return offset, 0.0, MOST_OFF
-        earliest = -float(np.min(received - offset - interval * numbers)) / interval
-        return offset, interval, min(max(TIMES_EARLIER * earliest, LEAST_EARLY), MOST_OFF)
+        return float(received.mean() - interval * numbers.mean()), interval
