@@ -200,6 +200,24 @@ def test_a_run_without_either_is_exported_as_before(tmp_path):
         )
 
 
+@pytest.mark.parametrize("name", ["x", "rotation", "largest_displacement"])
+def test_a_parameter_called_as_a_column_of_the_pose(name, tmp_path):
+    """`x_mm` was there twice: of two columns of one name a reader gets the last."""
+    block = stretched_block_model()
+    stretch, slide = block.parameters
+    block = replace(block, parameters=(stretch, replace(slide, name=name)))
+    folder = write_run(tmp_path / "run", block, block)
+    with (folder / "frames.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert len(set(header)) == len(header)
+    tracked = [dict(zip(header, row, strict=True)) for row in rows if row[2] == "tracked"]
+    title = f"{name}_mm" if name == "rotation" else f"{name} [mm]"
+    close([float(row[title]) for row in tracked], [1e3 * state[1] for state in STATES.values()])
+    close([float(row["x_mm"]) for row in tracked], 1e3 * POSE.translation[0])
+    states = StateChoice(path=folder / "frames.csv").states(block)
+    np.testing.assert_allclose(states, [state[:2] for state in STATES.values()], rtol=1e-5)
+
+
 def refused_for(model, match, **choice):
     with pytest.raises(ExportError, match=match):
         StateChoice(**choice).states(model)

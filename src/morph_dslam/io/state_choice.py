@@ -313,12 +313,21 @@ def _times(header: Sequence[str], rows: Sequence[list[str]]) -> Array | None:
     return times if np.isfinite(times).all() and (np.diff(times) > 0).all() else None
 
 
+def _without_twins(header: Sequence[str]) -> list[str]:
+    """The titles, of a run's table without those that stand for a pose beside a parameter of their name: "x [mm]"."""
+    if "pose_from" not in header:
+        return list(header)
+    named = {name_and_unit(title) for title in header if title.endswith("]")}
+    return ["" if not title.endswith("]") and name_and_unit(title) in named else title for title in header]
+
+
 def _column_of(parameter: Parameter, header: Sequence[str], path: Path) -> tuple[int, str] | None:
     """The column that holds a parameter, and its unit; None if there is none.
 
     A title in the parameter's own unit goes before "name" alone and "name_unit" in another one: a parameter may be
     called as one of the columns of ``frames.csv`` ("time" as ``time_ms``).
     """
+    header = _without_twins(header)
     units, all_units = FACTORS[parameter.quantity], {unit for known in FACTORS.values() for unit in known}
     found, wrong = dict[int, str](), []
     for column, title in enumerate(header):

@@ -25,7 +25,7 @@ from morph_dslam.io.hdf5_writing import written_hdf5
 from morph_dslam.io.run_states import FORMAT, VERSION
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.io.writing import writing
-from morph_dslam.model import save_model
+from morph_dslam.model import Parameter, save_model
 from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.stated_errors import force_error, uncounted
@@ -234,16 +234,32 @@ def _reaction_columns(run: RunResults) -> tuple[list[str], list[list[str]]]:
     return names, rows
 
 
+#: Columns of ``frames.csv`` before and behind those of the parameters.
+_FIRST = ("frame", "timestamp_s", "status", "reason", "pose_from")
+_LAST = (
+    *("largest_displacement_mm", "largest_displacement_std_mm"),
+    *("x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"),
+    *("residual_rms_px", "unexplained_px", "n_points", "n_inliers", "time_ms"),
+)
+
+
+def _parameter_titles(parameters: Sequence[Parameter], others: set[str]) -> list[str]:
+    """Three columns for each: ``bend_deg``, or ``x [mm]`` where ``x_mm`` is another column."""
+    taken, titles = set(others), list[str]()
+    for p in parameters:
+        three = [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
+        if not taken.isdisjoint(three):
+            three = [f"{p.name} [{p.unit}]", f"{p.name}_std [{p.unit}]", f"{p.name} at_bound"]
+        taken.update(three)
+        titles += three
+    return titles
+
+
 def write_csv(path: Path, run: RunResults) -> None:
     """Write ``frames.csv``: millimetres, degrees, milliseconds, and parameters in their own units."""
     parameters = run.model.study_parameters
-    header = ["frame", "timestamp_s", "status", "reason", "pose_from"]
-    for p in parameters:
-        header += [f"{p.name}_{p.unit}", f"{p.name}_std_{p.unit}", f"{p.name}_at_bound"]
-    header += ["largest_displacement_mm", "largest_displacement_std_mm"]
-    header += ["x_mm", "y_mm", "z_mm", "rotation_x_deg", "rotation_y_deg", "rotation_z_deg"]
-    header += ["residual_rms_px", "unexplained_px", "n_points", "n_inliers", "time_ms"]
     (of_reactions, reactions), (of_points, points) = _reaction_columns(run), _point_columns(run)
+    header = [*_FIRST, *_parameter_titles(parameters, {*_FIRST, *_LAST, *of_reactions, *of_points}), *_LAST]
     largests = 1e3 * run.largest_displacements()
     more = [[*forces, *displacements] for forces, displacements in zip(reactions, points, strict=True)]
     rows = zip(run.frames, run.timestamps, run.results, run.at_bound(), largests, more, strict=True)
