@@ -21,6 +21,7 @@ from morph_dslam.identification.measured_forces import MeasuredForces
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.missed_states import missed_state_notes, state_figures
 from morph_dslam.identification.moved_states import moved_state_notes, moved_states
+from morph_dslam.identification.point_doubts import MOST_MISSED, point_doubt_notes, point_doubts
 from morph_dslam.identification.values import FACTOR
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
@@ -99,6 +100,7 @@ def _misfit_figures(misfit: Misfit, found: Identification) -> dict[str, Any]:
         return figures | _force_figures(misfit, measurement, identified, found.size_factor(measurement))
     if isinstance(measurement, MeasuredPoints):
         figures |= {"span_of_object": measurement.span, "states": state_figures(misfit, measurement)}
+        figures |= point_doubts(misfit, measurement, found)
         return figures | (_motion_figures(misfit, measurement) if measurement.aligned else {})
     return figures
 
@@ -136,8 +138,8 @@ def _force_figures(
     return figures | ({"offset": misfit.offset} if forces.free_zero else {})
 
 
-#: Note what is missed by more than this part of what the load changed; points that lie within this part of the object.
-MOST_MISSED, LEAST_SPAN = 0.25, 0.05
+#: Note points that lie within this part of the object.
+LEAST_SPAN = 0.05
 #: Estimates that are more correlated than this, either way, are named.
 CORRELATED = 0.95
 #: Estimates that are less correlated than this hardly depend on each other.
@@ -302,13 +304,15 @@ def _doubts(each: Mapping[str, Any]) -> list[str]:
     """What speaks against a measurement being what the model describes."""
     said, name, unit = [], each["name"], each["unit"]
     if each["rms"] > MOST_MISSED * each["change_rms"]:
-        check = "--reaction" if "support" in each else "that x, y, z are positions in the object frame (--align-points)"
+        where = "one frame" if "moved_rms" in each else "the object frame (--align-points)"
+        check = "--reaction" if "support" in each else f"that x, y, z are positions in {where}"
         said.append(
             f"note: {name} changed by {each['change_rms']:.3g} {unit} rms, and {each['rms']:.3g} {unit} of it is "
             f"missed: check the units, and {check}"
         )
     said += missed_state_notes(each)
     said += moved_state_notes(each)
+    said += point_doubt_notes(each)
     span, share = each.get("span_of_object"), each.get("share_of_range")
     if span is not None and span < LEAST_SPAN:
         said.append(

@@ -1,0 +1,96 @@
+"""Tables of points in another unit, of other axes or another origin, and with a value that is far off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morph_dslam.identification.identify import identify
+from morph_dslam.identification.measured_points import MeasuredPoints
+from morph_dslam.identification.report import identification_lines, summarise
+from tests.support.edge_plate import CORNERS, plate_of_load
+
+LOADS, TRUTH, NOISE = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 0.3, 2e-3
+TURN = Rotation.from_rotvec([0.2, -0.1, 0.3])
+DOUBTS = {"far_off": [], "read_otherwise": None, "moved_as_one": None}
+
+
+def points(seed: int = 0, rows: tuple[int, ...] = (0, 1, 2, 3), beside: float = 0.0) -> MeasuredPoints:
+    """Corners of a plate of 1 m, in a table right but for noise, and each put ``beside`` its place, m."""
+    rng = np.random.default_rng(seed)
+    states = tuple(f"state {i}" for i in range(len(LOADS)) for _ in rows)
+    places, load = np.tile(CORNERS[list(rows)], (len(LOADS), 1)), np.repeat(LOADS, len(rows))
+    measured = places * np.column_stack([1.0 + TRUTH * load, np.ones_like(load), np.ones_like(load)])
+    measured += NOISE * rng.normal(size=places.shape) + np.tile(
+        beside * rng.normal(size=(len(rows), 3)), (len(LOADS), 1)
+    )
+    return MeasuredPoints(plate_of_load(), states, {"load": load}, places, measured)
+
+
+def figures(table: MeasuredPoints) -> tuple[dict[str, Any], str]:
+    """Of the table, and what is said."""
+    found = summarise(identify(table.model, [table], ["a"]))
+    return found["measurements"][0], "\n".join(identification_lines(found))
+
+
+def doubts(table: MeasuredPoints) -> dict[str, Any]:
+    each, _ = figures(table)
+    return {name: each[name] for name in DOUBTS}
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+def test_right_points_are_not_doubted(aligned: bool) -> None:
+    table = points()
+    measured = TURN.apply(table.measured) + np.array([0.1, 2.0, 0.3]) if aligned else table.measured
+    assert doubts(replace(table, measured=measured, aligned=aligned)) == DOUBTS
+
+
+@pytest.mark.slow
+def test_markers_beside_their_places_are_no_other_frame() -> None:
+    """Three of them by 20 mm: one motion takes up most of that."""
+    raised = [doubts(points(seed, (0, 1, 2), beside=0.02)) != DOUBTS for seed in range(15)]
+    assert sum(raised) == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "times", "axes", "says"),
+    [
+        (lambda x: 1e3 * x, 1e-3, ["x", "y", "z"], "with 0.001 times x, y and z: check the unit"),
+        (lambda x: 0.1 * x, 10.0, ["x", "y", "z"], "with 10 times x, y and z: check the unit"),
+        (lambda x: x[:, [1, 0, 2]], 1.0, ["y", "x", "z"], "with y, x, z as x, y, z: check the order"),
+        (lambda x: x * [-1.0, 1.0, 1.0], 1.0, ["-x", "y", "z"], "with -x, y, z as x, y, z: check the order"),
+    ],
+)
+def test_another_unit_and_other_axes_are_named(
+    wrong: Callable[[np.ndarray], np.ndarray], times: float, axes: list[str], says: str
+) -> None:
+    table = points()
+    each, text = figures(replace(table, measured=wrong(table.measured)))
+    assert (each["read_otherwise"]["times"], each["read_otherwise"]["axes"]) == (times, axes)
+    assert says in text
+
+
+def test_a_value_that_is_far_off_is_named() -> None:
+    """By 60 mm along z, of which the stretch takes up nothing."""
+    table = points()
+    table.measured[6, 2] += 0.06
+    each, text = figures(table)
+    ((far),) = each["far_off"]
+    assert (far["state"], far["row"], far["coordinate"]) == ("state 1", 7, "z")
+    assert far["missed"] == pytest.approx(-60.0, abs=4e3 * NOISE)
+    assert "z of point 7 (state state 1)" in text
+
+
+def test_another_origin_is_named_where_points_are_not_aligned() -> None:
+    """What is left then is the noise: 60 values less the stretch, five loads and six of the motion."""
+    table = points()
+    shifted = replace(table, measured=table.measured + np.array([0.0, 0.05, 0.03]))
+    each, text = figures(shifted)
+    assert each["moved_as_one"]["rms"] == pytest.approx(1e3 * NOISE, rel=0.25)
+    assert "give --align-points" in text
+    assert doubts(replace(shifted, aligned=True)) == DOUBTS
