@@ -376,6 +376,14 @@ class Estimator:
         """`estimate` from all that was measured in a frame."""
         return self.finished(self.fitted(measured, start, prior), measured.weights, measured.numbers)
 
+    def restated(self, measured: Observations, estimate: Estimate, prior: Prior | None = None) -> Estimate:
+        """An estimate with deviations by its residuals, and by what is known now, not when it was made."""
+        cost, hessian, _, _ = self.evaluate(
+            measured.points, measured.pixels, measured.weights, estimate.state, measured.normals, prior, measured.depths
+        )
+        minimum = Minimum(estimate.state, cost, hessian, estimate.residuals, estimate.iterations, estimate.converged)
+        return self.finished(minimum, measured.weights, measured.numbers)
+
     def fitted(self, measured: Observations, start: State, prior: Prior | None = None) -> Minimum:
         """`minimum` of all that was measured in a frame."""
         return self.minimum(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +74,15 @@ class FrameEstimation:
     def fitted(self, attempt: PoseHypothesis) -> Estimate:
         """The estimate from an attempt's measurements and what is known of parameters now."""
         return self._estimator.fit(self.measured(attempt, correlated=False), attempt.estimate.state, attempt.prior)
+
+    def any_loads(self) -> AbstractContextManager[None]:
+        """Meanwhile no unknown loads are likelier than others."""
+        loads = self._estimator.loads
+        return nullcontext() if loads is None else loads.set_aside()
+
+    def restated(self, attempt: PoseHypothesis, estimate: Estimate) -> Estimate:
+        """An estimate from an attempt's measurements with deviations by what is known now, see `Estimator.restated`."""
+        return self._estimator.restated(self.measured(attempt, correlated=False), estimate, attempt.prior)
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""

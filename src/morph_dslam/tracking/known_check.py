@@ -1,17 +1,20 @@
 """Whether the images refute what is known of parameters: a sensor with another zero, unit or clock.
 
 An estimate holds to what is known, and what that does not fit is left in the residuals, which would put the blame on
-model, camera and registration. So the images are asked alone, with all errors that they and the model have.
+model, camera and registration. So the images are asked alone, with all errors that they and the model have. Where
+unknown loads may do what a parameter does, images tell little of it: its deviation is that beside any loads.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.model_errors import ModelErrors
+from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.outcomes import KnownRefuted
@@ -48,12 +51,17 @@ def refuted_values(
     with known.set_aside():
         alone = estimation.fitted(hypothesis)
         common_px = max(systematic.unexplained(alone, hypothesis.inliers).px, doubt_px)
-        weights, prior = hypothesis.weights, hypothesis.prior
-        blurred, depths = hypothesis.blurred, hypothesis.point_depths
-        others = depths, estimation.hessian_of_outline(replace(hypothesis, estimate=alone))
-        learns = learns and blurred is None
-        alone = systematic.added(alone, weights, common_px, prior, learns, None, False, blurred, *others)
-    found, variances = alone.state.parameters[rows], deviations**2 + np.diag(alone.covariance)[rows]
+
+        def stated(estimate: Estimate, learns: bool) -> Array:
+            """Variances of the known parameters with all errors."""
+            others = hypothesis.point_depths, estimation.hessian_of_outline(replace(hypothesis, estimate=estimate))
+            asked = hypothesis.weights, common_px, hypothesis.prior, learns, None, False, hypothesis.blurred
+            return np.diag(systematic.added(estimate, *asked, *others).covariance)[rows]
+
+        variances = stated(alone, learns and hypothesis.blurred is None)
+        if known.model.n_loads:
+            variances = np.maximum(variances, _beside_any_loads(hypothesis, estimation, alone, stated))
+    found, variances = alone.state.parameters[rows], deviations**2 + variances
     if errors is not None:
         variances = variances + np.diag(errors.at(alone.state.parameters).parameters)[rows]
     sizes = np.abs(found - values) / np.sqrt(variances)
@@ -63,3 +71,23 @@ def refuted_values(
         for p, value, by_images, size in zip(parameters, values, found, sizes, strict=True)
         if size > REFUTED
     ]
+
+
+def _beside_any_loads(
+    hypothesis: PoseHypothesis, estimation: FrameEstimation, alone: Estimate, stated: Callable[[Estimate, bool], Array]
+) -> Array:
+    """Variances of the known parameters where any unknown loads are as likely as others.
+
+    What loads are likely is learned from the same frames: it makes an estimate, but no case against a sensor. They act
+    to second order, and where they are large, images may seem to tell them from a parameter. They must do so where the
+    sensor is right, too.
+
+    Parameters
+    ----------
+    hypothesis, estimation : as of `refuted_values`.
+    alone : the images' own estimate.
+    stated : variances (k,) of an estimate with all errors, and whether to learn from its residuals.
+    """
+    with estimation.any_loads():
+        places = (alone, replace(alone, state=hypothesis.estimate.state))
+        return np.max([stated(estimation.restated(hypothesis, place), False) for place in places], axis=0)

@@ -8,6 +8,8 @@ covariance that was found. All that is a term of the estimator's cost.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -60,7 +62,7 @@ class LoadPrior:
 
     def __init__(self, energy: ElasticEnergy, options: LoadOptions) -> None:
         self._energy, self._loads, self.squared_px = energy, energy.loads, 0.25
-        self._is_stated = options.work is not None
+        self._is_stated, self._is_aside = options.work is not None, False
         self.forget()
 
     @cached_property
@@ -68,8 +70,20 @@ class LoadPrior:
         """Of the spots (m, s); only the prior that learns needs them."""
         return spot_displacements(self._energy.model, self._loads)
 
+    @contextmanager
+    def set_aside(self) -> Iterator[None]:
+        """Meanwhile any loads are as likely as others: what do the images tell of a parameter beside these?"""
+        self._is_aside = True
+        try:
+            yield
+        finally:
+            self._is_aside = False
+
     def terms(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost, and its Hessian (m, m) and gradient (m,) by the loads, at parameters (n,); in squared pixels."""
+        if self._is_aside:
+            m = self._loads.count
+            return 0.0, np.zeros((m, m)), np.zeros(m)
         away = parameters[-self._loads.count :] - self.known.mean
         push = self.known.inverse @ away
         cost = 0.5 * float(push @ away)
