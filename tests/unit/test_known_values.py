@@ -145,3 +145,10 @@ def test_a_registration_takes_in_what_is_known_in_its_frame():
     assert turn == pytest.approx(step[3:6], abs=1e-12)
     assert found.state.camera_from_object.translation == pytest.approx(POSE.translation + step[6:], abs=1e-12)
     assert registered_with(Registration(MODEL, TRUTH, covariance), known, 8).state is TRUTH
+
+
+def test_values_of_no_tracked_frame_are_named(tmp_path):
+    known = KnownValues.read(write(tmp_path, "frame,arch_mm", "100,30", "120,31"), MODEL)
+    (text,) = known.remarks([3, 4, 5])
+    assert text == "--known told nothing: its values are of frames 100 to 120, and frames 3 to 5 were tracked"
+    assert known.remarks([99, 100]) == []

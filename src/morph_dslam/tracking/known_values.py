@@ -76,6 +76,13 @@ class KnownValues:
             raise TrackingError(f"{path} has no value of a parameter")
         return cls(columns.indices, by_frame)
 
+    def remarks(self, frames: Sequence[int]) -> list[str]:
+        """What a reader must know where these values are of none of the frames that were tracked."""
+        if not self.by_frame.keys().isdisjoint(frames):
+            return []
+        given, tracked = (f"{min(numbers)} to {max(numbers)}" for numbers in (self.by_frame, frames))
+        return [f"--known told nothing: its values are of frames {given}, and frames {tracked} were tracked"]
+
 
 @dataclass(frozen=True)
 class _Columns:

@@ -361,6 +361,8 @@ class _Job:
         if checked is not None:
             facts["camera"] = {term: found.facts() for term, found in checked.terms.items()}
             notices += [Remark(note) for note in camera_notes(checked, deforms)]
+        known = part.object.known
+        notices += [] if known is None else map(Remark, known.remarks(folder.results.frames))
         if part.options.use_discrepancy and part.model.stresses:
             notices.append(Remark(f"{NOT_IN_EQUILIBRIUM}; those in plots and tables are the model's without it"))
         if isinstance(self._source, SynchronizedFrames):
