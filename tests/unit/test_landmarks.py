@@ -23,8 +23,11 @@ from morph_dslam.registration.messages import (
 )
 from morph_dslam.registration.registration import load_registration
 from morph_dslam.registration.starts import shape_starts, solve_pnp
+from morph_dslam.sources import Frame
 from morph_dslam.studies.rigid import build_rigid
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.rig import RigCamera
+from morph_dslam.tracking.setup import TrackedObject
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA
@@ -387,3 +390,18 @@ def test_clicks_of_an_object_at_rest_do_not_accuse_it(seed):
     (said,) = register_landmarks(MODEL, CAMERA, off, at_rest=True).warnings
     assert type(said) is PoorFit
     assert said.sigma_px == pytest.approx(2.0, rel=0.4)
+
+
+@pytest.mark.parametrize("frame", [5, -1])
+def test_landmarks_of_another_frame_are_not_used_in_this_one(frame):
+    """The picture of another frame does not show the object there."""
+    points, pixels = np.zeros((9, 3)), np.zeros((9, 2))
+    part = TrackedObject("sheet", MODEL, Landmarks(points, pixels, np.full(9, 3)))
+    wanted = "set in frame 3 are used in (frame 5|the reference image)"
+    for landmarks in (None, Landmarks(points, pixels, np.full(9, 3))):
+        with pytest.raises(RegistrationError, match=wanted):
+            part.register(
+                [RigCamera(CAMERA, RigidTransform.identity())],
+                Frame(frame, 0.0, np.zeros((4, 4, 3), dtype=np.uint8)),
+                landmarks,
+            )

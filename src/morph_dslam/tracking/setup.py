@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morph_dslam.camera import Camera
-from morph_dslam.errors import CameraError, TrackingError
+from morph_dslam.errors import CameraError, RegistrationError, TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.camera_files import load_camera, load_rig
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
@@ -92,6 +92,8 @@ class TrackedObject:
             return start
         camera = cameras[0].camera
         if isinstance(start, Landmarks):
+            for landmarks in (start, *(self.other_landmarks if start is self.start else ())):
+                _check_frame(landmarks, frame.index)
             others = list(zip(cameras[1:], self.other_landmarks, strict=False)) if start is self.start else []
             # Several cameras show how far away the object is.
             depth = frame.depth if self.options.use_depth and not others else None
@@ -115,6 +117,17 @@ class TrackedObject:
         """The options with what the registration leaves open."""
         names = dict.fromkeys((*registration.per_sequence, *self.options.per_sequence))
         return replace(self.options, per_sequence=tuple(names))
+
+
+def _check_frame(landmarks: Landmarks, frame: int) -> None:
+    """Raise RegistrationError if landmarks say that they were set in another frame."""
+    others = [] if landmarks.frames is None else sorted({*landmarks.frames.tolist()} - {frame})
+    if others:
+        used = f"frame {frame}" if frame >= 0 else "the reference image"
+        raise RegistrationError(
+            f"landmarks that were set in frame {others[0]} are used in {used}: give those of that frame, choose the "
+            "other one (--reference-frame), or leave out the column of frames if they belong there"
+        )
 
 
 def load_cameras(run: TrackOptions) -> tuple[RigCamera, ...]:
