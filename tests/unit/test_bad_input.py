@@ -1,6 +1,7 @@
 """What a user gets wrong at the command line: one message that says what to mend, and status 2."""
 
 import multiprocessing
+import re
 import subprocess
 import sys
 import time
@@ -29,6 +30,7 @@ from morph_dslam.io.folders import clear_run_folder, make_run_folder, only_write
 from morph_dslam.io.landmarks import load_landmarks
 from morph_dslam.io.state_choice import read_path
 from morph_dslam.io.trajectory import load_trajectory
+from morph_dslam.io.video import VideoWriter
 from morph_dslam.material_tests.tables import load_test
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.inp_writing import save_mesh
@@ -211,6 +213,23 @@ def test_nothing_of_a_run_that_is_overwritten_stands_in_the_report_of_the_next(t
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert not left & {*of_the_run, "latency.csv", "augmented.mp4"}
     assert left >= {"own.png", "notes.txt", "plots/own.txt", "result.h5", "model.morph"}  # the reader's own, the run
+
+
+@pytest.mark.parametrize("is_live", [False, True])
+def test_pictures_of_a_live_run_have_their_time_and_no_numbers_of_frames(is_live, tmp_path):
+    """Its video stands still where frames were dropped: the picture at one place was called as the frame at another."""
+    write_run(tmp_path)
+    (tmp_path / "summary.json").write_text('{"live": {}}' if is_live else "{}")
+    with VideoWriter(tmp_path / "augmented.mp4", 20.0, (64, 48)) as video:
+        for level in range(41):
+            video.write(np.full((48, 64, 3), 5 * level, dtype=np.uint8))
+    page = write_run_report(tmp_path, load_run(tmp_path)).read_text()
+    captions = re.findall(r"<figcaption>(At [^<]*|Frame [^<]*)</figcaption>", page)
+    n = len(captions)
+    # Spread evenly over two seconds.
+    seconds = [f"At {2.0 * (k + 1) / (n + 1):.1f} s" for k in range(n)]
+    assert n > 1
+    assert captions == seconds if is_live else all(caption.startswith("Frame ") for caption in captions)
 
 
 def test_a_run_folder_has_one_writer(tmp_path):

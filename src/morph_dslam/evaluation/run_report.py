@@ -23,7 +23,7 @@ from morph_dslam.evaluation.points import MaterialError
 from morph_dslam.evaluation.report import Link, Picture, Section, Table, Text, write_report
 from morph_dslam.evaluation.run_folder import Run, remarks
 from morph_dslam.model import ReducedModel
-from morph_dslam.sources.frames import open_capture
+from morph_dslam.sources.frames import frame_rate, open_capture
 
 DPI = 110
 MEDIAN, MEAN = "#b4530a", "#1b1f24"
@@ -199,8 +199,8 @@ N_FRAMES_SHOWN = 4
 _SHOWN_ABOVE = ("model", "n_frames", "n_tracked", "median_ms", "p95_ms")
 
 
-def sample_video(path: Path, count: int) -> list[tuple[int, bytes]]:
-    """Up to ``count`` frames spread over a video, as (0-based position, JPEG); none if it cannot be read."""
+def sample_video(path: Path, count: int) -> list[tuple[int, float, bytes]]:
+    """Up to ``count`` frames spread over a video, as (0-based position, seconds, JPEG); none if it cannot be read."""
     capture = open_capture(str(path))
     total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     wanted = set(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1].tolist()) if total > 0 else set()
@@ -211,7 +211,8 @@ def sample_video(path: Path, count: int) -> list[tuple[int, bytes]]:
         if not read:
             break
         if position in wanted:
-            pictures.append((position, cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()))
+            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
+            pictures.append((position, position / frame_rate(capture), jpeg))
     capture.release()
     return pictures
 
@@ -299,9 +300,11 @@ def _evaluations(folder: Path) -> list[Section]:
 def _video_section(folder: Path, run: Run) -> Section:
     if not (folder / VIDEO).is_file():
         return Section("Augmented video", [])
+    # That of a live run stands still where frames were dropped: its pictures are not the run's frames one by one.
+    is_live = "live" in _content(folder / "summary.json")
     frames = [
-        Picture(data, ".jpg", f"Frame {run.frames[min(position, len(run.frames) - 1)]}")
-        for position, data in sample_video(folder / VIDEO, N_FRAMES_SHOWN)
+        Picture(data, ".jpg", f"At {s:.1f} s" if is_live else f"Frame {run.frames[min(position, len(run.frames) - 1)]}")
+        for position, s, data in sample_video(folder / VIDEO, N_FRAMES_SHOWN)
     ]
     return Section("Augmented video", [Link(VIDEO, f"The whole video ({VIDEO})"), *frames])
 
