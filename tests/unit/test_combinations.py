@@ -58,6 +58,8 @@ FREE_LID = ObjectOptions(model=Path("lid.morph"), landmarks=CSV)
         ({"video": False, "drawing": DrawOptions("strain")}, "--no-video"),
         ({"video": False, "drawing": DrawOptions(section=SectionPlane.parse("x=3"))}, "--no-video"),
         ({"video": False, "drawing": DrawOptions(section=SectionPlane.parse("x=3")), "streams": ("ws",)}, "--no-video"),
+        ({"video": False, "drawing": DrawOptions(forces=True), "streams": ("ws",)}, "--forces"),
+        ({"tracker": TrackerOptions(random_walk=(("bend", 0.1), ("bend", 0.2)))}, "--random-walk once"),
     ],
 )
 def test_what_makes_no_sense_together_is_refused(changes, named):

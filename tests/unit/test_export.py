@@ -459,6 +459,16 @@ def test_formats_and_colours_that_do_not_exist_are_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_value_beside_a_column_of_it_is_refused(tmp_path):
+    """It changed nothing."""
+    table_of = tmp_path / "table.csv"
+    table_of.write_text("slide [mm]\n1\n2\n")
+    with pytest.raises(ExportError, match=r"--at slide changes nothing: .* has the column 'slide \[mm\]'"):
+        StateChoice(path=table_of, at=["slide=2"]).states(stretched_block_model())
+    found = StateChoice(path=table_of, at=["stretch=0.1"]).states(stretched_block_model())
+    np.testing.assert_allclose(found, [[0.1, 0.001], [0.1, 0.002]])
+
+
 def test_a_value_may_have_a_unit_of_its_own():
     states = StateChoice(vary=["slide=-1 cm:2mm:2"], at=["stretch=0.1"]).states(stretched_block_model())
     np.testing.assert_allclose(states, [[0.1, -0.01], [0.1, 0.002]])

@@ -200,7 +200,9 @@ def read_run(model: ReducedModel, result: Path, in_camera: bool) -> States:
     return States(loaded, run.parameters, origins, run.times).with_run(run, in_camera)
 
 
-def read_path(model: ReducedModel, path: Path, base: Array, in_camera: bool = False) -> States:
+def read_path(
+    model: ReducedModel, path: Path, base: Array, in_camera: bool = False, fixed: Sequence[str] = ()
+) -> States:
     """The states in the rows of a CSV table.
 
     A column is headed "name [unit]", as in the table of an export, or "name_unit", as in the ``frames.csv``
@@ -219,6 +221,10 @@ def read_path(model: ReducedModel, path: Path, base: Array, in_camera: bool = Fa
         raise ExportError(f"'{model.name}' has no parameters, and so one state only: leave --path out")
     (_, header), *rows = read_csv(path, "path", ExportError) or [(1, [])]
     model, columns = _columns(model, header, path)
+    for k, (column, _) in columns.items():
+        if model.parameters[k].name in fixed:
+            name = model.parameters[k].name
+            raise ExportError(f"--at {name} changes nothing: {path} has the column '{header[column]}'; leave one out")
     base = np.concatenate([base, np.zeros(model.n_loads)])
     states, taken = [], []
     for line, row in rows:
@@ -440,7 +446,7 @@ class StateChoice:
             return States.of(model, grid(model, self.vary, base) if self.vary else tour(model, base))
         path = Path(self.path)
         if not path.is_dir() and path.suffix.lower() not in (".h5", ".hdf5"):
-            return read_path(model, path, base, in_camera)
+            return read_path(model, path, base, in_camera, [text.partition("=")[0] for text in self.at])
         if self.at:
             raise ExportError(f"--at {self.at[0]} changes nothing: a run has all parameters; leave it out")
         return read_run(model, path / RESULT if path.is_dir() else path, in_camera)

@@ -120,6 +120,8 @@ def run_slam(
     images = None if images is None else Path(images)
     options, start = options or SlamOptions(), _Start(map_path, trajectory, images)
     start.check(options, refine)
+    if depth_per_metre is not None and not options.use_depth:
+        raise MapError("--depth-per-metre says how depth images are to be read: leave it or --no-depth out")
     own_camera = output / "camera.yaml"
     written = [*replaced_files(output, "slam"), *([own_camera] if refine or overwrite else [])]
     grown = map_path if options.extend else None  # it may take its own place
@@ -132,8 +134,10 @@ def run_slam(
         more["inputs"]["depth_per_metre"] = depth_per_metre
     with stream if isinstance(stream, LiveStream) else nullcontext(), only_writer(output):
         make_run_folder(output, overwrite, "slam")
+        refined: Camera | None = None
         if refine:
-            one_or_two, more["refined_camera"] = _refined(stream, one_or_two, refine, options, progress)
+            refined, more["refined_camera"] = _refined(stream, one_or_two, refine, options, progress)
+            one_or_two = refined
         known, recorded = start.known(one_or_two), None
         if isinstance(known, Trajectory | ColmapModel):
             recorded = open_source(images or source, fps=None if images else fps)
@@ -159,9 +163,12 @@ def run_slam(
             summary: dict[str, Any] = {}
             if frames:
                 scene = replace(finish_scene(slam, frames, again), refined=tuple(refine))
+                if options.freeze_at is not None and options.freeze_at > frames[-1].index:
+                    last = frames[-1].index
+                    notes += (f"--freeze-at {options.freeze_at} had no effect: the last frame was {last}",)
                 _clear(output, video)
-                if refine:
-                    save_camera(own_camera, one_or_two)
+                if refined is not None:
+                    save_camera(own_camera, refined)
                 summary = write_run(output, scene, more, notes)
     return summary
 

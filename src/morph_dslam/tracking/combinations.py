@@ -8,6 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import TrackingError
 from morph_dslam.model.shown_field import shown_field
 from morph_dslam.registration.registration import Registration
+from morph_dslam.sources.recorded import MOST_TIME_DIFFERENCE
 from morph_dslam.streams.destinations import check_destination
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NO_MAP, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
@@ -47,6 +48,10 @@ OF_OBJECT: tuple[tuple[Callable[[ObjectOptions], bool], str], ...] = (
     (
         lambda part: part.snap and part.tracker.use_depth,
         "depth says where the object is in the frame of the landmarks: leave out --snap or --depth",
+    ),
+    (
+        lambda part: len(dict(part.tracker.random_walk)) < len(part.tracker.random_walk),
+        "a parameter walks by one step from frame to frame: give --random-walk once for each",
     ),
     (
         lambda part: part.tracker.pose == "still" and part.registration is not None,
@@ -165,6 +170,10 @@ OF_RUN: tuple[tuple[Callable[[TrackOptions], bool], str], ...] = (
         "--section says what the video shows: leave it or --no-video out",
     ),
     (
+        lambda run: not run.video and run.serve is None and run.drawing.forces,
+        "--forces says what the video shows: leave it or --no-video out",
+    ),
+    (
         lambda run: not run.video and run.serve is None and not run.streams and run.drawing.show is not None,
         "--show says what the video and streams show: leave it or --no-video out",
     ),
@@ -199,6 +208,12 @@ def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:
 
 def check_depth(run: TrackOptions, objects: Sequence[TrackedObject], source: object) -> None:
     """Raise TrackingError if depth images are to be used that the source of frames has not."""
+    off = getattr(source, "depth_off_s", None)
+    if any(part.options.use_depth for part in objects) and off is not None:
+        raise TrackingError(
+            f"no depth image of {run.frames} was taken within {1e3 * MOST_TIME_DIFFERENCE:g} ms of a frame, the "
+            f"nearest {off:.3g} s from one: put rgb.txt and depth.txt on one clock, or track it without --depth"
+        )
     if any(part.options.use_depth for part in objects) and not getattr(source, "has_registered_depth", False):
         raise TrackingError(
             f"{run.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
