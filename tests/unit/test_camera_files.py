@@ -311,6 +311,9 @@ def test_a_camera_chosen_from_a_colmap_model(tmp_path):
         (ORB_SLAM3.replace("KannalaBrandt8", "Omni"), "unknown Camera.type 'Omni'"),
         (EUROC.replace("pinhole", "eucm"), "unknown camera model 'eucm'"),
         (EUROC.replace("[752, 480]", "752"), "resolution is not a list of numbers"),
+        (EUROC.replace("[752, 480]", "[.nan, 480]"), "width: "),
+        (EUROC.replace("[752, 480]", "[752, .inf]"), "height: "),
+        (EUROC.replace("[752, 480]", "[752.7, 480]"), "width: "),
         ("M1: [1]\nM2: [1]\n", "stereo calibration without single cameras"),
     ],
 )

@@ -297,5 +297,7 @@ def test_a_column_is_told_from_a_path_by_the_file_that_is_there(tmp_path, monkey
         ("curve.csv:a:b", ("curve.csv", "a:b")),
         ("none.csv:force", ("none.csv", "force")),
         ("C:\\curve.csv", ("C:\\curve.csv", None)),
+        ("c" * 5000, ("c" * 5000, None)),
+        ("c" * 5000 + ":force", ("c" * 5000, "force")),
     ):
         assert file_and_column(text) == (Path(found[0]), found[1])

@@ -15,7 +15,7 @@ import pytest
 
 import morph_dslam as md
 from morph_dslam.errors import ExploreError
-from morph_dslam.explorer.server import make_server
+from morph_dslam.explorer.server import ModelPages, make_server
 from morph_dslam.extend.studies import build_rigid
 from morph_dslam.io.access import HOST
 from morph_dslam.model import save_model
@@ -204,3 +204,8 @@ def test_a_page_that_is_closed_at_once_is_no_error(serve, capfd):
             closed.sendall(b"GET /three/three.core.min.js HTTP/1.1\r\nHost: localhost\r\n\r\n")
     assert get("/model.json")[0] == 200
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("target", ["//[", "http://[", "[?mu=1"])
+def test_what_is_no_url_is_not_there(target):
+    assert ModelPages(stretched_block_model()).answer(target) is None

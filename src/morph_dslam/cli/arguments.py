@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -97,6 +98,14 @@ def positive_number(text: str) -> float:
     return value
 
 
+def percentage(text: str) -> float:
+    """A number of percent above zero, up to 100."""
+    value = positive_number(text)
+    if value > 100.0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of percent up to 100")
+    return value
+
+
 def positive_integer(text: str) -> int:
     """A whole number above zero."""
     if not text.isdecimal() or int(text) == 0:
@@ -139,11 +148,11 @@ def named_place(text: str) -> tuple[str, tuple[float, float, float]]:
 
 def file_and_column(text: str) -> tuple[Path, str | None]:
     """A path, and the column after a colon: "curve.csv", "curve.csv:force_N"; "C:\\curve.csv" is a path."""
-    if Path(text).exists():
+    if os.path.exists(text):  # as `Path.exists`, but of a name that is longer than one may be too
         return Path(text), None
     for colon in re.finditer(":", text):  # names of files and of columns may have some of their own
         name, column = text[: colon.start()], text[colon.end() :]
-        if Path(name).is_file():
+        if os.path.isfile(name):
             return Path(name), column
     name, colon, column = text.rpartition(":")
     if colon and not set(column) & set("/\\"):

@@ -10,7 +10,7 @@ from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import matplotlib
 import numpy as np
@@ -161,17 +161,17 @@ class ModelPages:
         BadRequest
             If the query describes no state of the model.
         """
-        url = urlsplit(target)
-        if url.path in _FILES:
-            name = _FILES[url.path]
+        path, _, asked = target.partition("?")  # what is no URL is a page that is not there
+        if path in _FILES:
+            name = _FILES[path]
             content = files("morph_dslam.explorer").joinpath("static", *name.split("/")).read_bytes()
             return _TYPES[Path(name).suffix], content
-        if url.path == "/model.json":
+        if path == "/model.json":
             return "application/json", self._model_json
-        if url.path == "/shape.bin":
+        if path == "/shape.bin":
             return "application/octet-stream", self._shape
-        if url.path == "/state.bin":
-            query = {name: values[-1] for name, values in parse_qs(url.query, keep_blank_values=True).items()}
+        if path == "/state.bin":
+            query = {name: values[-1] for name, values in parse_qs(asked, keep_blank_values=True).items()}
             return "application/octet-stream", self._state(query)
         return None
 

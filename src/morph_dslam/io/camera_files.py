@@ -387,7 +387,7 @@ def _from_kalibr(content: Mapping, where: str) -> Mapping:
     values = _first(content, ("distortion_coeffs", "distortion_coefficients"))
     coefficients = [] if values is None else _numbers(values, None, f"{where}: distortion coefficients")
     lens = _lens_keys(content.get("distortion_model"), coefficients, where)
-    return {"width": int(width), "height": int(height), "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
+    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens}
 
 
 def _check_size(width: object, height: object, where: str, lines: str) -> None:
