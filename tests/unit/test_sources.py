@@ -3,6 +3,7 @@
 import re
 import struct
 from datetime import datetime, timedelta
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 from PIL import ExifTags, Image
 
 from morph_dslam import sources
-from morph_dslam.errors import SourceError
+from morph_dslam.errors import SourceError, TrackingError
 from morph_dslam.extend import register_source
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
 from morph_dslam.sources.frames import check_range, notes_of_source, read_image
+from morph_dslam.tracking.combinations import check_depth
 from tests.support.full_disk import largest_file
 from tests.support.real_data import ROOT, real_data
 
@@ -78,11 +80,15 @@ def test_images_are_known_by_their_content(tmp_path):
         list(open_source(misnamed))
 
 
-@pytest.mark.parametrize(("orientation", "turn", "said"), [(3, cv2.ROTATE_180, 2), (6, cv2.ROTATE_90_CLOCKWISE, 1)])
-def test_images_are_turned_as_other_programs_show_them(tmp_path, orientation, turn, said):
-    """Upside down the principal point is mirrored; either way the rows are not the camera's."""
-    picture = np.full((32, 48, 3), 40, dtype=np.uint8)
-    picture[:16, :24] = 220
+@pytest.mark.parametrize("width", [48, 32])
+@pytest.mark.parametrize(
+    ("orientation", "turn", "said"),
+    [(3, cv2.ROTATE_180, 2), (6, cv2.ROTATE_90_CLOCKWISE, 1), (8, cv2.ROTATE_90_COUNTERCLOCKWISE, 1)],
+)
+def test_images_are_turned_as_other_programs_show_them(tmp_path, orientation, turn, said, width):
+    """Upside down the principal point is mirrored; either way the rows are not the camera's. One is square."""
+    picture = np.full((32, width, 3), 40, dtype=np.uint8)
+    picture[:16, : width // 2] = 220
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     Image.fromarray(picture).save(tmp_path / "0.jpg", quality=95, exif=exif)
@@ -405,6 +411,25 @@ def test_tum_keeps_time_and_depth(tum):
     assert [frame.depth is None for frame in frames] == [False, True, True]
     assert source.fps == pytest.approx(1.0 / 0.034, rel=1e-3)
     assert [frame.index for frame in open_source(tum, 1, 1)] == [1]
+
+
+def test_depth_of_another_clock_says_how_far_it_is_off(tum):
+    assert open_source(tum).depth_off_s is None
+    (tum / "depth.txt").write_text("1305031102.7433 depth/a.png\n1305031103.2733 depth/b.png\n")
+    source = open_source(tum)
+    assert not source.has_registered_depth
+    assert source.depth_off_s == pytest.approx(0.5)
+    options = SimpleNamespace(use_depth=True)
+    with pytest.raises(TrackingError, match=r"within 20 ms of a frame, the nearest 0\.5 s from one"):
+        check_depth(SimpleNamespace(frames=tum), [SimpleNamespace(options=options)], source)
+
+
+def test_hidden_files_beside_images_are_no_images(tmp_path):
+    """A Mac leaves one for each picture on drives of other systems."""
+    for number in range(3):
+        save_image(tmp_path / f"{number:06d}.png", number)
+        (tmp_path / f"._{number:06d}.png").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X        ")
+    assert [frame.index for frame in open_source(tmp_path)] == [0, 1, 2]
 
 
 def test_tum_without_depth_and_with_a_broken_list(tum):

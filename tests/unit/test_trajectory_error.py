@@ -355,6 +355,17 @@ def test_a_truth_without_times_is_paired_by_frame_number(tmp_path, name, first):
         evaluate_trajectory(run, tmp_path / name)
 
 
+def test_numbers_of_frames_are_compared_as_they_are_beside_a_table_of_frames(tmp_path):
+    """An estimate of another program, as KITTI's file, that was put into the run folder."""
+    truth = swaying()
+    write_numbered(tmp_path, truth.world_from_camera)
+    run = numbered_run(tmp_path / "run", truth)
+    (run / "other.txt").write_bytes((tmp_path / "kitti.txt").read_bytes())
+    figures = evaluate_trajectory(run / "other.txt", tmp_path / "kitti.txt")
+    assert figures["n_pairs"] == 120
+    assert figures["se3"]["absolute_mm"]["rmse"] < 1e-6
+
+
 def test_a_truth_of_other_frames_is_refused(tmp_path):
     truth = swaying()
     write_numbered(tmp_path, truth.world_from_camera)

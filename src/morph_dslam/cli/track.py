@@ -150,7 +150,11 @@ def _complete(arguments: argparse.Namespace) -> None:
     arguments.frames, arguments.camera = found.recording, arguments.camera or found.camera
     arguments.model = arguments.model or _found_model(found)
     arguments.output = arguments.output or folder / "run"
-    words = [str(arguments.frames) if Path(word) == folder else word for word in arguments.words]
+    before = ["", *arguments.words]  # the folder of the results may be the same one
+    words = [
+        str(arguments.frames) if Path(word) == folder and option not in ("-o", "--output") else word
+        for option, word in zip(before, arguments.words, strict=False)
+    ]
     named = [(f"--{name}", str(getattr(arguments, name))) for name in missing]
     print(shlex.join(["morph", *words, *chain(*named)]))
 

@@ -17,6 +17,7 @@ from morph_dslam.cli.arguments import (
     frame_and_file,
     named_place,
     named_value,
+    percentage,
     positive_number,
 )
 
@@ -160,7 +161,7 @@ def _add_forces(group: _Group) -> None:
     group.add_argument(
         "--unknown-loads",
         nargs="?",
-        type=float,
+        type=positive_number,
         const=0.0,
         metavar="JOULES",
         help="estimate loads that the study does not foresee, by [unknown_loads] of its model: what presses or pulls "
@@ -169,7 +170,7 @@ def _add_forces(group: _Group) -> None:
     add_flag(group, "--forces", "draw what supports exert on the object as arrows, with its size")
     group.add_argument(
         "--modulus-std",
-        type=positive_number,
+        type=percentage,
         default=0.0,
         metavar="PERCENT",
         help="standard deviation of the moduli of the study, by one common factor: it counts in the reactions of "

@@ -52,8 +52,7 @@ class MissingFrame(Frame):
 class FrameStream(Protocol):
     """Frames one after the other, recorded or live.
 
-    One whose frames have depth that belongs to their pixels says so by ``has_registered_depth = True``; ``notes`` are
-    sentences that a reader of the results must know.
+    One whose frames have depth that belongs to their pixels says so by ``has_registered_depth = True``.
     """
 
     name: str
@@ -199,8 +198,8 @@ class DepthScale:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images in a folder, by name: those that are called so or, without any, those that are some."""
-    files = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    """The images in a folder, by name: those that are called so or, without any, those that are some; none hidden."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     return [path for path in files if named_kind(path) in IMAGES] or [f for f in files if file_kind(f) in IMAGES]
 
 
@@ -216,8 +215,8 @@ def turned_deg(path: Path, what: str) -> int:
     """By how many degrees an image is turned to be shown: 0, 90 to either side, or 180."""
     stored = _decode(path, what, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     shown = read_image(path, what)
-    if shown.shape != stored.shape:
-        return 90
+    if shown.shape != stored.shape or any(np.array_equal(shown, np.rot90(stored, k)) for k in (1, -1)):
+        return 0 if np.array_equal(shown, stored) else 90
     return 0 if np.array_equal(shown, stored) else 180
 
 

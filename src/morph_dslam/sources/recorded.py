@@ -75,9 +75,11 @@ class RecordedFrames:
     Attributes
     ----------
     has_assumed_times : whether nothing tells the times, which then go by numbers of frames and `ASSUMED_FPS`.
+    depth_off_s : how far the nearest depth image is from any frame, seconds, where none belongs to one by its time.
     """
 
     has_assumed_times = False
+    depth_off_s: float | None = None
 
     def __init__(
         self,
@@ -277,15 +279,19 @@ def tum_recording(folder: Path, first: int | None = None, last: int | None = Non
     """The images that `rgb.txt` lists with the depth of `depth.txt` taken closest to them; numbered from 0."""
     depths = _read_tum_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
     depth_times = np.array([timestamp for timestamp, _ in depths])
-    records = []
+    records, offs = [], []
     for index, (timestamp, path) in enumerate(_read_tum_list(folder / "rgb.txt")):
         depth = None
         if depths:
             nearest = int(np.abs(depth_times - timestamp).argmin())
-            if abs(depth_times[nearest] - timestamp) <= MOST_TIME_DIFFERENCE:
+            offs.append(float(abs(depth_times[nearest] - timestamp)))
+            if offs[-1] <= MOST_TIME_DIFFERENCE:
                 depth = depths[nearest][1]
         records.append(_ImageRecord(index, timestamp, path, depth=depth))
-    return RecordedFrames(folder, records, first, last, depth_scale=TUM_DEPTH)
+    frames = RecordedFrames(folder, records, first, last, depth_scale=TUM_DEPTH)
+    if offs and min(offs) > MOST_TIME_DIFFERENCE:
+        frames.depth_off_s = min(offs)
+    return frames
 
 
 def _read_tum_list(path: Path) -> list[tuple[float, Path]]:

@@ -56,6 +56,7 @@ Array = NDArray[np.float64]
 
 #: Why several cameras refuse an object whose outline is all there is.
 NO_TEXTURE = "the object shows too few corners, and its outline alone is followed with one camera: leave out --with"
+OUTLINE_ALONE = "the outline alone (--no-texture) is followed with one camera: leave it or --with out"
 
 
 #: A camera of which a smaller share of the points agrees with all cameras together contradicts them.
@@ -145,7 +146,7 @@ class RigTracker:
                     f"camera {number}: {part.not_seen(registration.state, model) or error}"
                 ) from error
             if tracker.reference.outline_alone:
-                raise RegistrationError(f"camera {number}: {NO_TEXTURE}")
+                raise RegistrationError(f"camera {number}: {NO_TEXTURE}" if self.options.use_texture else OUTLINE_ALONE)
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
