@@ -10,7 +10,9 @@ import trimesh
 from morph_dslam.camera import Camera
 from morph_dslam.errors import ArgumentError, RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.landmarks import Landmarks, load_landmarks, save_landmarks
+from morph_dslam.model import save_model
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import (
     Ambiguity,
@@ -405,3 +407,15 @@ def test_landmarks_of_another_frame_are_not_used_in_this_one(frame):
                 Frame(frame, 0.0, np.zeros((4, 4, 3), dtype=np.uint8)),
                 landmarks,
             )
+
+
+def test_landmarks_to_register_anew_are_of_their_frame(tmp_path, refused):
+    save_model(tmp_path / "sheet.morph", MODEL)
+    save_camera(tmp_path / "camera.yaml", CAMERA)
+    for name, frames in (("first.csv", None), ("later.csv", np.full(14, 5))):
+        found = landmarks()
+        save_landmarks(tmp_path / name, Landmarks(found.points, found.pixels, frames))
+    names = {"--model": "sheet.morph", "--camera": "camera.yaml", "--landmarks": "first.csv", "-o": "run"}
+    words = [word for option, name in names.items() for word in (option, tmp_path / name)]
+    later = f"7={tmp_path / 'later.csv'}"
+    assert "set in frame 5 are used in frame 7" in refused("track", "film", *words, "--reregister-at", later)

@@ -174,6 +174,9 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
     points = NamedPoints.of(model, part.points)
     known = None if part.known is None else KnownValues.read(part.known, model)
     again = {n: None if path is None else load_landmarks(path) for n, path in part.reregister_at}
+    for number, landmarks in again.items():
+        if landmarks is not None:
+            _check_frame(landmarks, number)
     if part.time_zero is not None:
         _check_clock(KnownTime.of(model, part.time_zero), known)
     options, zero = part.tracker, part.time_zero
