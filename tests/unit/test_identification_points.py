@@ -50,6 +50,14 @@ def test_right_points_are_not_doubted(aligned: bool) -> None:
     assert doubts(replace(table, measured=measured, aligned=aligned)) == DOUBTS
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_three_markers_whose_places_are_measured_in_each_state_tell_no_other_frame(seed: int) -> None:
+    """They are 20 mm beside their places, which themselves err by 2 mm."""
+    table = points(seed, (0, 1, 2), beside=0.02)
+    jitter = 2e-3 * np.random.default_rng(100 + seed).normal(size=table.places.shape)
+    assert doubts(replace(table, places=table.places + jitter))["moved_as_one"] is None
+
+
 @pytest.mark.slow
 def test_markers_beside_their_places_are_no_other_frame() -> None:
     """Three of them by 20 mm: one motion takes up most of that."""

@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
 from morph_dslam.better_fit import chance_of_better_fit
@@ -26,6 +29,8 @@ MOST_LEFT = 0.5
 MOST_MISSED = 0.25
 #: A value is far off where it is missed by so many times the usual deviation, and no more than this share of all are.
 FAR, MOST_FAR = 10.0, 0.05
+#: Places within this part of the object are of one marker: its place may be measured again for each state.
+ONE_PLACE = 0.02
 #: The deviation of normal errors over the median of their sizes.
 NORMAL = 1.4826
 #: Units that are taken for each other; predictions over the range of the unknowns with which readings are compared (a
@@ -78,7 +83,7 @@ def _far_off(misfit: Misfit, points: MeasuredPoints) -> list[dict[str, Any]]:
 def _moved_as_one(misfit: Misfit, points: MeasuredPoints) -> dict[str, float] | None:
     """What is missed once all points are moved as one body; None where that does not leave much less.
 
-    The statistic is F, of the means of each place over the states: markers that are put on the body beside their places
+    The statistic is F, of the means of each marker over the states: markers that are put on the body beside places
     err in all states alike. What known parameters that are off in each state explain is none of it.
     """
     if points.aligned or not np.isfinite(points.measured).all():
@@ -89,7 +94,7 @@ def _moved_as_one(misfit: Misfit, points: MeasuredPoints) -> dict[str, float] | 
     null = np.hstack([misfit.slopes, *(slopes * rows for rows in in_state)])
     both = np.hstack([null, replace(points, aligned=True).loose(misfit.predicted)])
     without, with_it = (root_mean_square(_left(misfit.missed, columns)) for columns in (null, both))
-    place = np.unique(points.places, axis=0, return_inverse=True)[1].ravel()
+    place = _markers(points)
     mean = np.array([place == each for each in np.unique(place)], dtype=float)
     mean /= mean.sum(axis=1, keepdims=True)
     missed, null, both = (
@@ -103,6 +108,15 @@ def _moved_as_one(misfit: Misfit, points: MeasuredPoints) -> dict[str, float] | 
     least = max(misfit.model_rms, ROUNDING * float(np.abs(points.values).max()))
     chance = chance_of_better_fit(sums[0], sums[1], after - before, len(missed) - after, least)
     return {"rms": points.scale * with_it} if chance < CHANCE and with_it < MOST_LEFT * without else None
+
+
+def _markers(points: MeasuredPoints) -> NDArray[np.int64]:
+    """A label of each row (r,): rows are of one marker where their places are the same but for their own error."""
+    size = float(np.linalg.norm(np.ptp(points.model.nodes, axis=0)))
+    pairs = cKDTree(points.places).query_pairs(ONE_PLACE * size, output_type="ndarray")
+    rows = len(points.places)
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(rows, rows))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _left(missed: Array, columns: Array) -> Array:
