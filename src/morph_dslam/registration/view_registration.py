@@ -167,6 +167,7 @@ class EdgeSearch:
         self._points, self._views, self.camera, self.metric = points, list(views), camera, metric
         self._hints, self._claimed, self._most_keyframes = hints, claimed, most_keyframes
         self.scale_std = METRIC_SCALE_STD if metric else np.inf
+        self._middle = self.edges.nodes.mean(axis=0)
 
     def search(self) -> list[EdgeRegistration]:
         """Distinct places, the best first; none where nothing resembles the object.
@@ -272,7 +273,7 @@ class EdgeSearch:
             alone = one.refine(self.edges, found.place, NEAREST, self._hints.clicks, keep_scale=True)[0]
             pose = camera_from_object(view, alone)
             unit = map_unit(pose, self.edges, view, self._dense[0], self.camera)[0]
-            start = placed(pose, view, unit if unit > 0.0 else alone.scale, self.metric)
+            start = placed(pose, view, unit if unit > 0.0 else alone.scale, self._middle, self.metric)
             return self._fitted(start, images, NEAREST)
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
@@ -404,7 +405,7 @@ class EdgeSearch:
         # A large plane fits any flat face, so that its points may mislead; but the object's faces may be planes.
         both = _diverse(found, by_all, N_BY_ALL, N_BY_ALL), _diverse(found, by_telling, N_BY_TELLING, MOST_ALIKE)
         best = [k for pair in zip_longest(*both) for k in pair if k is not None]
-        return [placed(found.pose(k), view, float(unit[k]), self.metric) for k in dict.fromkeys(best)]
+        return [placed(found.pose(k), view, float(unit[k]), self._middle, self.metric) for k in dict.fromkeys(best)]
 
     def _where_said(self) -> list[SimilarityTransform]:
         """Where landmarks and a guess have the object."""
@@ -438,7 +439,7 @@ class EdgeSearch:
     def _by_guess(self, guess: GuessedPose) -> list[SimilarityTransform]:
         """Where the keyframe next to a guess has the object near it, the best first."""
         rng, pose = np.random.default_rng(0), guess.pose
-        centre = pose.apply(self.edges.nodes.mean(axis=0))
+        centre = pose.apply(self._middle)
         column, row = self.camera.project(centre[None])[0] if centre[2] > 0.0 else (-1.0, -1.0)
         if not (0.0 <= column < self.camera.width and 0.0 <= row < self.camera.height):
             raise RegistrationError(
@@ -465,7 +466,9 @@ class EdgeSearch:
         view = self._beside(seen.frame)
         near = RigidTransform.from_matrix(view.camera_from_world.matrix @ np.linalg.inv(seen.camera_from_world.matrix))
         known = view.camera_from_world.apply(self._dense[0].positions[view.point_ids])[:, 2]
-        usual = float(np.median(known)) / max(float(pose.translation[2]), 1e-9) if len(known) else 1.0
+        # From the object's middle: its frame may have its origin anywhere.
+        ahead = max(float(pose.apply(self._middle)[2]), 1e-9)
+        usual = float(np.median(known)) / ahead if len(known) else 1.0
         # Points agree on the unit only about where it is right already. In their own view it changes nothing.
         factors = np.geomspace(1.0 / UNIT_FROM, UNIT_FROM, N_UNITS) if view.frame != seen.frame else np.ones(1)
         best, most = 1.0, 0
@@ -477,7 +480,7 @@ class EdgeSearch:
                 unit = found if found > 0.0 else unit
             if agreeing > most:
                 best, most = unit, agreeing
-        return placed(pose, seen, best, self.metric)
+        return placed(pose, seen, best, self._middle, self.metric)
 
 
 def _diverse(found: InView, speaking: Array, most: int, most_alike: int) -> list[int]:

@@ -481,11 +481,12 @@ def map_unit(
     return float(np.median(ratios[first : last[first]])), int(last[first] - first), len(ratios)
 
 
-def placed(pose: RigidTransform, view: HasPose, unit: float, metric: bool) -> SimilarityTransform:
+def placed(pose: RigidTransform, view: HasPose, unit: float, middle: Array, metric: bool) -> SimilarityTransform:
     """The world_from_object of an object at a pose, metres, in a view of a map of so many units per metre.
 
-    In a metric map the object keeps its size, and is moved along the sight line to where its points are.
+    In a metric map the object keeps its size, and its ``middle`` (3,), object frame, is moved along the sight line to
+    where its points are.
     """
-    world = view.camera_from_world.inverse
-    scale = 1.0 if metric else unit
-    return SimilarityTransform(scale, world.rotation @ pose.rotation, world.apply(unit * pose.translation))
+    world, scale = view.camera_from_world.inverse, 1.0 if metric else unit
+    origin = unit * pose.apply(middle) - scale * pose.rotation @ middle
+    return SimilarityTransform(scale, world.rotation @ pose.rotation, world.apply(origin))
