@@ -10,12 +10,14 @@ from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.meshing.generators import tube
+from morph_dslam.registration.edges import Sighting
+from morph_dslam.registration.hints import Hints
 from morph_dslam.registration.icp import Surface, fit_surface
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, register_mesh
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, OtherSize, OutlineElsewhere, TooLittleTexture
 from morph_dslam.registration.register import register
 from morph_dslam.registration.registration import Axis, Rival
-from morph_dslam.registration.scene import MapPoints, View
+from morph_dslam.registration.scene import MapPoints, View, camera_from_object
 from morph_dslam.registration.search_space import TURNS, attitudes, find_planes
 from morph_dslam.registration.texture import TextureComparison
 from morph_dslam.render.rasteriser import rasterise
@@ -27,6 +29,7 @@ from tests.support.bent_sheet import bent_sheet_model, grid_triangles
 from tests.support.rendered_object import CAMERA, cameras, scanned, wedge
 from tests.support.rendered_sequence import printed_texture
 from tests.support.staged_scenes import bending_wedge
+from tests.unit.test_keyframe_adjustment import corner, seen_corner
 
 WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 #: The same in a map whose unit is the metre.
@@ -140,6 +143,21 @@ def test_a_mesh_that_is_drawn_out_is_accused_by_its_outline(stretch):
     right = abs(found.world_from_object.scale / 3.7 - 1.0) < 0.01
     assert right == (stretch == 1.0)
     assert any(isinstance(warning, OutlineElsewhere) for warning in found.warnings) == (not right)
+
+
+@pytest.mark.slow
+def test_what_a_metric_map_says_of_the_scale_counts_once():
+    """Independent pieces of information add up: without it and with it they differ by that of its deviation of 1 %."""
+    nodes, triangles, _ = corner()
+    points, views = seen_corner(METRIC)
+    rows = np.linspace(0, len(nodes) - 1, 7).astype(int)
+    pixels = CAMERA.project(camera_from_object(views[0], METRIC).apply(nodes[rows]))
+    hints = Hints((Sighting(views[0].frame, views[0].camera_from_world, nodes[rows], pixels),))
+    known, free = (
+        register_mesh(nodes, triangles, points, views, CAMERA, metric=metric, hints=hints) for metric in (True, False)
+    )
+    added = 1.0 / known.covariance[0, 0] - 1.0 / free.covariance[0, 0]
+    assert added == pytest.approx(0.01**-2, rel=0.2)
 
 
 @pytest.mark.slow

@@ -277,13 +277,14 @@ def _by_edges(
     if aligned.rms_px > POOR_AGREEMENT_PX:
         return replace(found, unrefined=NotRefined(Unrefined.IMAGES_DIFFER, aligned.rms_px))
     adjustment = KeyframeAdjustment(nodes, triangles, search.camera, points, views, axis)
-    # As exact as the edges have it, where the images have it: what these leave open stayed there.
+    # As exact as the edges have it, where the images have it: what these leave open stayed there. Edges were fitted
+    # with what a metric map says of the scale, which counts once.
     known = KnownPlace(aligned.place, best.covariance)
     adjusted = _adjusted(
         replace(found, world_from_object=aligned.place, rms_px=aligned.rms_px, shape_shown=aligned.shows_its_shape),
         adjustment,
         nodes.mean(axis=0),
-        search.scale_std,
+        np.inf,
         known,
     )
     if adjusted.keyframes is None:
