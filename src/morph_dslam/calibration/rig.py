@@ -240,9 +240,9 @@ def _by_intrinsics(cameras: Sequence[Calibration], sightings: Sequence[_Sighting
 
 
 def _board_pose(camera: Camera, view: View) -> RigidTransform:
-    """Where a flat board is, from one view (Collins and Bartoli 2014, and least squares)."""
+    """Where a board is, which may be bent, from one view (Terzakis and Lourakis 2020, and least squares)."""
     pixels = camera.undistort_pixels(view.corners)
-    _, turn, shift = cv2.solvePnP(view.points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    _, turn, shift = cv2.solvePnP(view.points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP)
     turn, shift = cv2.solvePnPRefineLM(view.points, pixels, camera.matrix, None, turn, shift)  # type: ignore[call-overload]
     return RigidTransform(rotation_exp(np.ravel(turn).astype(float)), np.ravel(shift).astype(float))
 
