@@ -101,3 +101,21 @@ def test_an_image_resembles_the_keyframe_of_its_place():
         similarities = places.similarities(descriptors)
         assert similarities.argmax() == number
         assert similarities[number] > 1.1 * np.delete(similarities, number).max()
+
+
+def test_a_keyframe_that_is_described_after_it_was_taken_in_is_recognised():
+    """The camera may be lost while its newest keyframe is still being described."""
+    rng, rigid_map = np.random.default_rng(0), RigidMap()
+    descriptors = [rng.integers(0, 255, (300, 32)).astype(np.uint8) for _ in range(5)]
+    for number, each in enumerate(descriptors):
+        keyframe = Keyframe(number, 0.0, np.zeros((4, 4), np.uint8), np.eye(4), np.arange(0), np.empty((0, 2)))
+        if number < 4:
+            keyframe.descriptors = each
+        rigid_map.keyframes.append(keyframe)
+    places = PlaceIndex(rigid_map)
+    places.update()
+    assert places.similarities(descriptors[4])[4] == 0.0
+    rigid_map.keyframes[4].descriptors = descriptors[4]
+    places.update()
+    # An image resembles itself wholly.
+    assert places.similarities(descriptors[4])[4] == pytest.approx(1.0)

@@ -94,16 +94,21 @@ class PlaceIndex:
         self._vocabulary: Vocabulary | None = None
         self._n_trained = 0
         self._histograms = np.empty((0, N_WORDS))
+        self._described = np.empty(0, dtype=bool)
 
     def update(self) -> None:
-        """Take in the keyframes that are new."""
+        """Take in the keyframes that are new, or have been described since."""
         keyframes = self._map.keyframes
         if self._vocabulary is None or len(keyframes) >= RETRAIN_AT * self._n_trained:
             self._vocabulary = Vocabulary(np.concatenate([k.descriptors for k in keyframes]))
             self._n_trained = len(keyframes)
             self._histograms = np.empty((0, len(self._vocabulary.words)))
+            self._described = np.empty(0, dtype=bool)
+        described = np.array([len(k.descriptors) > 0 for k in keyframes])
+        for row in np.flatnonzero(described[: len(self._described)] & ~self._described):
+            self._histograms[row] = self._vocabulary.histogram(keyframes[row].descriptors)
         new = [self._vocabulary.histogram(k.descriptors) for k in keyframes[len(self._histograms) :]]
-        self._histograms = np.vstack([self._histograms, *new])
+        self._histograms, self._described = np.vstack([self._histograms, *new]), described
 
     def similarities(self, descriptors: Descriptors) -> Array:
         """How much an image with these descriptors (k, 32) resembles each keyframe (n,), from 0 to 1."""
