@@ -70,6 +70,24 @@ def test_the_camera_is_found_in_the_world_of_a_trajectory(room, poses):
     assert scene.slam.is_frozen
 
 
+@pytest.mark.slow
+def test_poses_by_frame_numbers_belong_to_the_frames_of_these_numbers(room, poses):
+    """As KITTI's files have them: taken for seconds, every thirtieth frame of this film had one, of another frame."""
+    numbered = replace(poses, timestamps=np.rint(30.0 * poses.timestamps), is_numbered=True)
+    assert largest_error(room, track(room, numbered)) < 0.005
+
+
+@pytest.mark.slow
+def test_looking_for_a_camera_again_leaves_the_map_as_it_is(room, poses):
+    slam = track(room, poses).slam
+    before, finder = (slam.map.usual_rms_px, slam.map.n_expected.copy(), slam.map.n_found.copy()), slam.finder()
+    found = [finder.process_frame(image, index, index / 30) for index, image in enumerate(room[1][:4])]
+    assert any(frame.pose is not None for frame in found)
+    assert slam.map.usual_rms_px == before[0]
+    np.testing.assert_array_equal(slam.map.n_expected, before[1])
+    np.testing.assert_array_equal(slam.map.n_found, before[2])
+
+
 @pytest.fixture(scope="module")
 def colmap(room, tmp_path_factory):
     """A COLMAP model of every fourth image: corners, with their points by the renderer's depth."""

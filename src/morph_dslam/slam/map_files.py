@@ -44,10 +44,13 @@ LEAST_FOUND = 0.4
 def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: FrameImages) -> RigidMap:
     """Points triangulated from the frames of a recording that have a pose, with these poses.
 
-    Lengths are the trajectory's.
+    Lengths are the trajectory's. Poses that have frame numbers instead of times belong to the frames of these numbers.
 
     Raises MapError if fewer than three frames have a pose, or too few points obey the poses.
     """
+    is_numbered = trajectory.is_numbered
+    if is_numbered:
+        trajectory = replace(trajectory, timestamps=trajectory.timestamps / source.fps)
     rigid_map = RigidMap()
     rigid_map.has_given_lengths = True
     mapper = Mapper(rigid_map, images.camera, hold_poses=True, unknown_depth=FAR * trajectory.length)
@@ -58,9 +61,9 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
     # A motion capture system gives many poses while one image is read out.
     twists = velocities(trajectory.timestamps, poses, abs(images.camera.readout_s))
     for frame in source:
-        times.append(frame.timestamp)
-        nearest = int(np.abs(trajectory.timestamps - frame.timestamp).argmin())
-        if abs(trajectory.timestamps[nearest] - frame.timestamp) > MOST_TIME_DIFFERENCE:
+        times.append(frame.index / source.fps if is_numbered else frame.timestamp)
+        nearest = int(np.abs(trajectory.timestamps - times[-1]).argmin())
+        if abs(trajectory.timestamps[nearest] - times[-1]) > MOST_TIME_DIFFERENCE:
             continue
         n_posed += 1
         pose, twist = poses[nearest], twists[nearest]

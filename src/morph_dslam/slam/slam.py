@@ -128,7 +128,10 @@ class Slam:
         """One that finds the camera in the map there is now, and leaves the map as it is."""
         finder = copy(self)
         finder.is_frozen, finder.threaded = True, False
-        finder._begin(self.map)
+        # Its frames count in what a map knows of its points and its usual error.
+        own = RigidMap(self.map.baseline_px)
+        own.copy_of(self.map)
+        finder._begin(own)
         return finder
 
     def _begin(self, rigid_map: RigidMap) -> None:
