@@ -285,9 +285,12 @@ class Registration:
         return tuple(sorted(known, key=lambda view: view.frame != self.frame))
 
     def content(self) -> dict[str, Any]:
-        """All but model, discrepancy and scene as plain JSON: what `save` writes."""
-        content = {**self.facts, "ambiguous": self.ambiguous}
-        content["warnings"] = [warning.content() for warning in self.warnings]
+        """All but model, discrepancy and scene as plain JSON: what `save` writes.
+
+        JSON has no infinity: what is unknown, as the deviations that too few landmarks give, is None.
+        """
+        content = {**_known(self.facts), "ambiguous": self.ambiguous}
+        content["warnings"] = [_known(warning.content()) for warning in self.warnings]
         if self.map_registration is None:
             return content | {
                 "parameters": self.state.parameters.tolist(),
@@ -456,13 +459,18 @@ def read_content(path: Path) -> dict[str, Any]:
 def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
     """From `Registration.content`; raises KeyError, TypeError, ValueError or IndexError if it is none."""
     facts = {key: value for key, value in content.items() if key not in _NO_FACTS}
+    if facts.get("sigma_px", 0.0) is None:
+        facts["sigma_px"] = np.inf
     warnings = tuple(read_warning(warning) for warning in content["warnings"])
     if "world_from_object" not in content:
         d = len(model.parameters)
         pose = RigidTransform.from_matrix(_numbers(content["camera_from_object"], (4, 4)))
         state = State(_numbers(content["parameters"], (d,)), pose)
         covariance = content["state_covariance"]
-        covariance = covariance and np.array(covariance, dtype=np.float64).reshape(d + 6, d + 6)
+        if covariance is not None:
+            # Without infinity in JSON it is None, here NaN; earlier files have it.
+            covariance = np.array(covariance, dtype=np.float64).reshape(d + 6, d + 6)
+            covariance = np.where(np.isnan(covariance), np.inf, covariance)
         return Registration(model, state, covariance, facts=facts, warnings=warnings)
     placed = _placed(content)
     found = MapRegistration(placed, _numbers(content["mean_node_m"], (3,)), _optional(content["covariance"], (7, 7)))
@@ -522,4 +530,14 @@ def _optional(values: Any, shape: tuple[int, ...]) -> Array | None:
 
 
 def _list(array: Array | None) -> list | None:
-    return None if array is None else array.tolist()
+    """For JSON: what is not finite is None."""
+    if array is None:
+        return None
+    values = array.astype(object)
+    values[~np.isfinite(array)] = None
+    return values.tolist()
+
+
+def _known(content: dict[str, Any]) -> dict[str, Any]:
+    """Figures for JSON: those that are not finite are None."""
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in content.items()}
