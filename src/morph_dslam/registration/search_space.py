@@ -112,9 +112,11 @@ class Planes:
 
 
 def find_planes(points: Array, seed: int = 0) -> Planes:
-    """The planes of a map (n, 3), one after the other as long as one holds enough of the points."""
+    """The planes of a map (n, 3), one after the other as long as one holds enough points; few points have none."""
+    if len(points) < FEWEST_POINTS:
+        return Planes(0.0, np.empty(0, dtype=np.int64), [])
     rng = np.random.default_rng(seed)
-    distances = KDTree(points).query(points, k=min(5, len(points)))[0][:, -1]
+    distances = KDTree(points).query(points, k=5)[0][:, -1]
     spacing = float(np.median(distances))
     usable = np.flatnonzero(distances <= STRAY * spacing)
     left, taken_out = usable, []
