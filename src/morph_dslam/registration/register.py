@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError
 from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.io.camera_files import load_camera
@@ -54,6 +55,8 @@ from morph_dslam.tracking.anchoring import points_on_object
 
 #: Landmarks in one frame from which a search begins.
 FEWEST_CLICKS = 3
+#: Points across and along a box, through a lens whose formula may fold at the rim.
+BOX_POINTS = 33
 #: Keyframes in the picture of a registration.
 N_PICTURES = 3
 
@@ -82,19 +85,22 @@ def register(
     landmarks : three or more points of the object in one frame of the map's recording, or more in several frames; or
         the file that has them. They have frame numbers.
     distance : rough distance of the object from the camera, metres; it may be off by half.
-    region : number of a keyframe, and left, top, right and bottom of a box around the whole object in it, pixels, with
-        any margin up to half the object's width on each side.
+    region : number of a keyframe, and left, top, right and bottom of a box around the whole object in it, pixels of the
+        image as recorded, with any margin up to half the object's width on each side.
     guess : file that says about where the object is in a frame of the map's recording.
 
     Raises
     ------
     RegistrationError
-        If the object is not found, a hint names a frame without a pose, or landmarks cannot be right.
+        If the object is not found, a hint names a frame without a pose, or landmarks, distance or region cannot be
+        right.
     """
+    if distance is not None and not 0.0 < distance < np.inf:
+        raise RegistrationError(f"the distance of the object is {distance:g} m: it has to be more than nothing")
     hints = Hints(
         () if landmarks is None else _sightings(landmarks, scene, model, guess is not None),
         distance,
-        region,
+        None if region is None else (region[0], _undistorted(region[1], scene.camera)),
         None if guess is None else _guessed(Path(guess), scene),
     )
     claimed = partial(without_points_on, beside)
@@ -127,6 +133,18 @@ def register(
         warnings += (OnlyInBox(region[0]),)
     placed = registration_in_map(model, in_map, keyframes, facts, warnings, found.axis, scene)
     return replace(placed, rivals=found.rivals)
+
+
+def _undistorted(box: tuple[float, float, float, float], camera: Camera) -> tuple[float, float, float, float]:
+    """The box around a box in the image as recorded, by left, top, right and bottom, in the undistorted image."""
+    left, top, right, bottom = box
+    across, along = np.meshgrid(np.linspace(left, right, BOX_POINTS), np.linspace(top, bottom, BOX_POINTS))
+    pixels = camera.undistort_pixels(np.column_stack([across.ravel(), along.ravel()]))
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if not len(pixels):
+        raise RegistrationError("the lens shows nothing in the box that was given")
+    (left, top), (right, bottom) = pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()
+    return left, top, right, bottom
 
 
 def _outline_share(found: MeshRegistration) -> float | None:
@@ -327,9 +345,14 @@ def run_registration(
         registration = register_board(scene, model, board)
     else:
         registration = register(scene, model, others, progress=True, **hints)
+    picture = output / "registration.jpg"
+    try:
+        picture.unlink(missing_ok=True)  # that of a registration before, which a board's has none of
+    except OSError as error:
+        raise RegistrationError(f"cannot replace {picture}: {error.strerror}") from error
     registration.save(output / "registration.json", map_path, model_path)
-    if board is None:
-        cv2.imwrite(str(output / "registration.jpg"), draw_registration(registration, scene))
+    if board is None and not cv2.imwrite(str(picture), draw_registration(registration, scene)):
+        raise RegistrationError(f"cannot write the picture {picture}")
     return registration
 
 
