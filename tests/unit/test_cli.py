@@ -183,6 +183,14 @@ def test_help_shows_arguments_in_groups(command, capsys):
     assert ("--refine" in shown) == (command == "track")
 
 
+@pytest.mark.parametrize("still", [True, False])
+def test_refining_what_one_pose_is_estimated_with_anyway_is_said_to_change_nothing(tmp_path, capsys, still):
+    """The files are absent, which is found afterwards."""
+    files = ["--model", "a.morph", "--camera", "c.yaml", "--landmarks", "l.csv", "-o", str(tmp_path / "run")]
+    assert cli.main(["track", str(tmp_path / "frames"), *files, "--refine", *(["--still"] if still else [])]) != 0
+    assert ("--refine changes nothing" in capsys.readouterr().out) == still
+
+
 @pytest.mark.parametrize("defect", [ZeroDivisionError, BrokenPipeError, SystemError])
 def test_defects_are_not_hidden(monkeypatch, defect):
     with pytest.raises(defect):

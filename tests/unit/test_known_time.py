@@ -41,7 +41,7 @@ def test_time_is_that_of_the_frame_after_the_zero_as_exact_as_half_an_interval_a
     assert known_in(119.8, known) == {}
     assert known.warnings == (TimeOutside("hold", "20.1 s", "0 to 20 s"),)
     assert known_in(99.0, known) == {}
-    assert [warning.time for warning in known.warnings] == ["-0.7 s"]
+    assert [(warning.time, warning.is_before) for warning in known.warnings] == [("-0.7 s", True)]
 
 
 def test_time_is_known_beside_a_sensor():

@@ -168,6 +168,7 @@ PER_FRAME = [
     (ReferenceBlurred(9.0), RunWarning.REFERENCE_BLURRED),
     (SamePlace("twin"), RunWarning.SAME_PLACE),
     (TimeOutside("hold", "21 s", "0 to 20 s"), RunWarning.TIME_OUTSIDE),
+    (TimeOutside("hold", "-2 s", "0 to 20 s", is_before=True), RunWarning.TIME_BEFORE),
     (KnownRefuted("arch", "3 mm", "5 mm", 7.0), RunWarning.KNOWN_REFUTED),
     (ModelDoesNotExplain(0.7), RunWarning.MODEL_FAILS),
     (ModelDoesNotExplain(0.7, 5.0), RunWarning.SHIFTED),
@@ -188,6 +189,35 @@ def test_a_run_says_in_how_many_frames_it_warns_and_in_which_first(warning, expe
     (notice,) = notices_of(run)
     assert (notice.warning, notice.data["count"], notice.data["first"]) == (expected, 2, 12)
     assert "first in frame 12" in notice.text
+
+
+def test_only_a_recording_that_is_before_the_models_time_throughout_is_called_wrong():
+    run = RunResults(MODEL, reference_frame=0)
+    before = TimeOutside("hold", "-2 s", "0 to 20 s", is_before=True)
+    sound = frame_result([0.0, 0.0, 0.0], [1e-3, 0.01, 0.01], [False] * 3)
+    run.add(0, 0.0, replace(sound, warnings=(before,)))
+    assert [notice.warning for notice in notices_of(run)] == [RunWarning.TIME_OUTSIDE]
+    run.add(1, 0.1, sound)
+    run.add(2, 0.2, replace(sound, warnings=(TimeOutside("hold", "21 s", "0 to 20 s"),)))
+    assert [(n.warning, n.data["count"], n.data["first"]) for n in notices_of(run)] == [
+        (RunWarning.TIME_BEFORE, 1, 0),
+        (RunWarning.TIME_OUTSIDE, 1, 2),
+    ]
+
+
+@pytest.mark.parametrize(("error", "is_told"), [(7e-12, False), (2e-6, True)])
+def test_a_force_does_not_say_that_rounding_is_not_counted(tmp_path, capsys, error, is_told):
+    modes = np.zeros((len(MODEL.displacement.modes), 1, 3))
+    modes[0] = [3.0, 4.0, 0.0]
+    force = SeparatedField(modes, MODEL.displacement.functions)
+    stated = {"relative_l2": error, "largest_N": 50.0}
+    model = replace(MODEL, certificate={"reaction_force_end": stated}, reactions={"force_end": force})
+    run = RunResults(model, reference_frame=0)
+    run.add(0, 0.0, replace(frame_result([0.03, 0.1, 0.1], [1e-3, 0.05, 0.01], [False] * 3), model=model))
+    print_summary(tmp_path, summarise(run))
+    said = capsys.readouterr().out
+    assert ("at given parameters" in said) == is_told
+    assert "N in frame 0, not counting" in said
 
 
 def test_fields_that_the_model_misses_are_named_and_forces_say_what_their_deviations_lack(tmp_path, capsys):

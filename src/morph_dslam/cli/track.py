@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 #: Options that say where the object is.
 _STARTS = ("landmarks", "registration", "board", "picture", "guess")
+#: A relative error below this is one of rounding.
+ROUNDING = 1e-9
 KEPT = "the frames tracked so far are kept in the run folder"
 
 
@@ -65,7 +67,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_flag(
         groups.measured,
         "--refine",
-        "refine the reference state over the whole sequence, with --discrepancy that too, and track once more",
+        "refine the reference state over the whole sequence, with --discrepancy that too, and track once more; --still "
+        "does that with the pose already",
     )
     groups.still.add_argument(
         "--refine-camera",
@@ -89,6 +92,10 @@ def run(arguments: argparse.Namespace) -> None:
         other_cameras=tuple(vars(arguments)["with"]),  # a keyword of the language
         other_landmarks=tuple(arguments.with_landmarks),
     )
+    if options.refine_reference and options.tracker.pose == "still":
+        print(
+            "note: --refine changes nothing here: --still estimates the reference pose over the whole sequence already"
+        )
     track_and_print(options)
 
 
@@ -219,7 +226,9 @@ def _not_counted(figures: dict[str, Any]) -> str:
     parts: list[str] = []
     if "model_error" in figures:
         of = "error" if figures["model_error_of"] == "all" else "reduction error"
-        parts.append(f"the model's own {of} at given parameters, {100.0 * figures['model_error']:.3g} %")
+        share = figures["model_error"]
+        if share > ROUNDING:
+            parts.append(f"the model's own {of} at given parameters, {100.0 * share:.3g} %")
     if figures["not_counted"]:
         *some, last = figures["not_counted"]
         parts.append(f"errors of the model's {' and '.join([', '.join(some), last] if some else [last])}")

@@ -58,5 +58,6 @@ class KnownTime:
         interval = 2.0 * most if self.before is None else timestamp - self.before
         self.before = timestamp
         if not parameter.lower <= time <= parameter.upper:
-            return TimeOutside(parameter.name, parameter.text(time), parameter.range_text)
+            is_before = time < parameter.lower
+            return TimeOutside(parameter.name, parameter.text(time), parameter.range_text, is_before)
         return time, min(0.5 * interval, most) if interval > 0.0 else most

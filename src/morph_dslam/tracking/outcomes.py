@@ -275,6 +275,7 @@ class TimeOutside(TrackingWarning):
     parameter : that measures time.
     time : of the frame, with its unit.
     range : of the parameter, with its unit.
+    is_before : whether the model's time has not begun.
     """
 
     template: ClassVar[str] = (
@@ -283,6 +284,7 @@ class TimeOutside(TrackingWarning):
     parameter: str
     time: str
     range: str
+    is_before: bool = False
 
 
 @dataclass(frozen=True)

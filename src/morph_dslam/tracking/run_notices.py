@@ -90,6 +90,10 @@ class RunWarning(StrEnum):
         "by up to {largest:.0f} standard deviations: check the sensor's zero, its unit, its clock and its deviation, "
         "and the registration; estimates there hold to the sensor, and what it does not fit is left in the images"
     )
+    TIME_BEFORE = (
+        "{count} of {n_frames} frames, first in frame {first}, are before the time at which the model's begins: "
+        "'{parameter}' counts as unknown there, and nothing should act yet"
+    )
     TIME_OUTSIDE = (
         "{count} of {n_frames} frames, first in frame {first}, are before the time at which the model's begins, or "
         "after the end of its range: '{parameter}' counts as unknown there; check --time-zero, or build with a longer "
@@ -285,7 +289,12 @@ def _of_frames(run: RunResults) -> list[RunNotice]:
     for other in sorted({warning.other for _, warning in same}):
         tell([(frame, w) for frame, w in same if w.other == other], kind.SAME_PLACE, other=other)
     outside = _warned(run, TimeOutside)
-    tell(outside, kind.TIME_OUTSIDE, parameter=outside[0][1].parameter if outside else "")
+    time = outside[0][1].parameter if outside else ""
+    # A recording may well begin before the load does, but not end then.
+    if len(outside) < len(run):
+        tell([one for one in outside if one[1].is_before], kind.TIME_BEFORE, parameter=time)
+        outside = [one for one in outside if not one[1].is_before]
+    tell(outside, kind.TIME_OUTSIDE, parameter=time)
     refuted = _warned(run, KnownRefuted)
     for name in dict.fromkeys(warning.parameter for _, warning in refuted):
         of_one = [(frame, warning) for frame, warning in refuted if warning.parameter == name]
