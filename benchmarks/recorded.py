@@ -349,8 +349,10 @@ BENCHMARKS = {
         "Mechanics",
         "What the certificate says of the elements",
         "python benchmarks/discretisation.py",
-        "elements of third order",
-        lines=6,
+        "hex27 cells on a mesh that is finer; of the last four lines, elements of third order solved to the end",
+        lines=16,
+        about="`load` is the error of the push that its displacement is taken for, stated over true; the true one is "
+        "positive where elements are too stiff.",
     ),
     "elements": Benchmark(
         "Mechanics",

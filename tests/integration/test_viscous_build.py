@@ -135,7 +135,7 @@ def test_an_increment_that_is_too_long_shows_in_the_discretisation_error() -> No
     }
     model = md.build(make_study(content))
     entry = model.certificate["discretisation"]
-    assert entry["method"] == "displacements of order 2 on the same cells, half the increments of time"
+    assert entry["method"] == "displacements of order 3 on the same cells, half the increments of time"
     errors = []
     for (held,) in entry["coordinates"]:
         truth = 30.0 / 3e6 * (1.0 + 1.5 * (1.0 - np.exp(-2.0 * held)))
