@@ -26,7 +26,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.meshing.mesh_checks import check_extent, described_extent
 from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces, find_faces
-from morph_dslam.meshing.surface_repair import repaired_surface
+from morph_dslam.meshing.surface_repair import repaired_surface, surface_parts
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -118,7 +118,10 @@ def _read_stl_or_ply(path: Path, kind: str) -> tuple[Array, Indices]:
 
 
 def check_watertight(surface: _TriangleSurface, path: Path) -> None:
-    """Raise StudyError unless every edge joins two triangles that turn alike, with the inside within."""
+    """Raise StudyError unless every edge joins two triangles that turn alike, with the inside within.
+
+    A closed part within another one is a cavity, and must face inwards: Netgen ends the process at one that does not.
+    """
     t = surface.triangles
     directed = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
     edges, inverse, counts = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -145,8 +148,15 @@ def check_watertight(surface: _TriangleSurface, path: Path) -> None:
             "units; make its normals consistent"
         )
     a, b, c = (surface.points[t[:, i]] for i in range(3))
-    if np.einsum("ti,ti->", a, np.cross(b, c)) <= 0.0:
+    wrong = [part for part in surface_parts(surface.points, t) if part.wrong]
+    if any(part.turn < 0 for part in wrong) or np.einsum("ti,ti->", a, np.cross(b, c)) <= 0.0:
         raise StudyError(f"the triangles of {path} face inwards; flip its normals")
+    if wrong:
+        place = ", ".join(f"{x:.6g}" for x in surface.points[t[wrong[0].faces]].mean(axis=(0, 1)))
+        raise StudyError(
+            f"a closed part of the surface {path} lies within another one, around ({place}) in file units, and both "
+            "face outwards: flip its normals if it is a cavity, or remove it"
+        )
 
 
 def closed_surface(path: Path) -> tuple[_TriangleSurface, dict[str, int]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -23,13 +24,16 @@ Indices = NDArray[np.int64]
 SAME_POINT = 1e-5
 #: A hole is closed up to this share of the surface, and up to so many edges; larger ones are openings of the object.
 LARGEST_HOLE, MOST_EDGES = 0.1, 400
+#: So many points of a part, at most, are looked at: all must lie within another one that holds it.
+PROBES = 8
 
 
 def repaired_surface(points: Array, triangles: Indices) -> tuple[Array, Indices, dict[str, int]]:
     """A surface that drawing and tracking can rely upon, and what had to be mended.
 
-    Neighbours turn alike and outwards (a part whose box lies within another's and that is turned inwards is a
-    cavity). Parts that cut into each other stay as they are.
+    Neighbours turn alike and outwards; a part within another one that is turned inwards is a cavity. Where every part
+    is turned the wrong way round, cavities too, all are turned. Parts that cut into each other stay as they are, and so
+    do those that lie within another one and face outwards: whether they are cavities nobody knows.
 
     Parameters
     ----------
@@ -114,20 +118,63 @@ def _turned(before: Indices, after: Indices) -> NDArray[np.bool_]:
     return np.all([(np.roll(before, shift, axis=1) != after).any(axis=1) for shift in range(3)], axis=0)
 
 
-def _turn_outwards(mesh: trimesh.Trimesh) -> int:
-    """Turn parts of negative volume that are no cavities; how many were turned."""
-    faces, corners = np.array(mesh.faces), np.asarray(mesh.triangles)
-    parts = _parts(mesh)
-    boxes = [(corners[part].min(axis=(0, 1)), corners[part].max(axis=(0, 1))) for part in parts]
-    count = 0
+@dataclass(frozen=True)
+class SurfacePart:
+    """Faces that edges join.
+
+    Attributes
+    ----------
+    faces : (k,) their numbers.
+    turn : 1 if they face outwards, -1 inwards, 0 if they bound no volume.
+    inner : whether an odd number of other parts hold it, as they hold a cavity.
+    """
+
+    faces: Indices
+    turn: int
+    inner: bool
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it faces the wrong way: a cavity's faces are turned into it."""
+        return self.turn == (1 if self.inner else -1)
+
+
+def surface_parts(points: Array, triangles: Indices) -> list[SurfacePart]:
+    """The parts of a surface (n, 3), (m, 3) whose edges join two triangles at most."""
+    mesh = trimesh.Trimesh(points, triangles, process=False)
+    corners, parts = np.asarray(mesh.triangles), _parts(mesh)
+    boxes = np.array([(corners[part].min(axis=(0, 1)), corners[part].max(axis=(0, 1))) for part in parts])
+    found = []
     for part, (low, high) in zip(parts, boxes, strict=True):
         a, b, c = np.moveaxis(corners[part] - corners[part].mean(axis=(0, 1)), 1, 0)
-        inwards = np.sum(a * np.cross(b, c)) < -1e-9 * np.linalg.norm(high - low) ** 3
-        if inwards and not any((lower < low).all() and (high < upper).all() for lower, upper in boxes):
-            faces[part] = faces[part][:, ::-1]
-            count += 1
+        volume = np.sum(a * np.cross(b, c)) / np.linalg.norm(high - low) ** 3
+        around = np.flatnonzero((boxes[:, 0] < low).all(axis=1) & (high < boxes[:, 1]).all(axis=1))
+        probes = corners[part[:: -(-len(part) // PROBES)], 0]
+        holders = sum(all(_holds(corners[parts[other]], probe) for probe in probes) for other in around)
+        found.append(SurfacePart(part, int(np.sign(volume)) if abs(volume) > 1e-9 else 0, holders % 2 == 1))
+    return found
+
+
+def _holds(corners: Array, point: Array) -> bool:
+    """Whether triangles (m, 3, 3) surround a point (3,): their solid angles (Van Oosterom and Strackee 1983) say it."""
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    lengths = [np.linalg.norm(edge, axis=1) for edge in (a, b, c)]
+    above = np.sum(a * np.cross(b, c), axis=1)
+    dots = [np.sum(one * other, axis=1) for one, other in ((a, b), (b, c), (c, a))]
+    below = np.prod(lengths, axis=0) + dots[0] * lengths[2] + dots[1] * lengths[0] + dots[2] * lengths[1]
+    return bool(abs(np.sum(np.arctan2(above, below))) > np.pi)
+
+
+def _turn_outwards(mesh: trimesh.Trimesh) -> int:
+    """Turn parts inside out that face inwards and are no cavities, all if all are wrong; how many were turned."""
+    faces = np.array(mesh.faces)
+    parts = surface_parts(np.asarray(mesh.vertices), faces)
+    every = all(part.wrong for part in parts)
+    turned = [part for part in parts if every or (part.wrong and part.turn < 0)]
+    for part in turned:
+        faces[part.faces] = faces[part.faces][:, ::-1]
     mesh.faces = faces
-    return count
+    return len(turned)
 
 
 def _without_holes(points: Array, triangles: Indices) -> tuple[Indices, int]:
