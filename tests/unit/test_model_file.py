@@ -49,6 +49,12 @@ def test_a_saved_model_is_read_back(path, model):
         np.testing.assert_allclose(loaded.von_mises(mu, face), model.von_mises(mu, face), rtol=1e-5)
 
 
+def test_stress_without_a_place_is_that_of_the_top_in_memory_and_from_a_file(path, model):
+    mu = np.array([0.03, 0.2, -0.1])
+    for one in (model, replace(model, stresses=dict(reversed(model.stresses.items()))), load_model(path)):
+        np.testing.assert_allclose(one.at(mu).stress(), model.stresses["top"].value(mu), rtol=1e-5)
+
+
 def test_the_same_model_gives_the_same_bytes(path, model, tmp_path):
     save_model(tmp_path / "again.morph", model)
     assert (tmp_path / "again.morph").read_bytes() == path.read_bytes()

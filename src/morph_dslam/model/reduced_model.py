@@ -456,7 +456,7 @@ class DeformedState:
 
         Parameters
         ----------
-        place : "solid" for solids, "top" or "bottom" for sheets; the first of `ReducedModel.stresses` if absent.
+        place : "solid" for solids, "top" or "bottom" for sheets; "solid" or "top" if absent.
         points : at which; all nodes if absent.
         """
         return self._value(f"stress_{self._places(place)[0]}", points)
@@ -481,8 +481,11 @@ class DeformedState:
         return {name: field.value(self.parameters, self.outside)[0] for name, field in fields.items()}
 
     def _places(self, place: str | None) -> list[str]:
-        """The places of the stress that are asked for; ParameterError if the model has none, or not this one."""
-        places = list(self.model.stresses)
+        """The places of the stress that are asked for; ParameterError if the model has none, or not this one.
+
+        The top comes first, whatever the order in the model: a file has none of its own.
+        """
+        places = sorted(self.model.stresses, key=lambda name: name != "top")
         if not places:
             raise ParameterError(f"the model '{self.model.name}' has no stress; it has {', '.join(self.model.fields)}")
         if place is not None and place not in places:
