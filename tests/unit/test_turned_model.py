@@ -5,9 +5,11 @@ import pytest
 
 from morph_dslam.errors import ModelFileError
 from morph_dslam.evaluation.model_summary import summarise_model
-from morph_dslam.meshing.generators import block
-from morph_dslam.model import load_model, save_model
+from morph_dslam.meshing.generators import block, tube
+from morph_dslam.meshing.meshes import model_mesh_of
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField, load_model, save_model
 from morph_dslam.model.basis_functions import chebyshev_basis, fourier_basis
+from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions
 from tests.support.bent_tube import AXIS, bent_tube, polynomial
@@ -96,3 +98,18 @@ def test_products_are_those_of_their_factors():
     np.testing.assert_allclose(product.mixed(matrix).rows([x, a]), rows @ matrix)
     with pytest.raises(ValueError, match="mixed by a matrix"):
         ProductFunctions(first, CPFunctions((chebyshev_basis(0.0, 1.0, 2),), (unit,), unit), np.eye(4))
+
+
+@pytest.mark.parametrize("cell", ["hex20", "prism15", "hex27"])
+def test_second_order_cells_have_two_nodes_each_around(cell):
+    """z² of bending along x, turned by an angle between two cells; one of the modes is zero everywhere."""
+    mesh = tube(0.02, 0.024, 0.06, (2, 1, 12), cell)
+    z, surface = mesh.nodes[:, 2], model_mesh_of(mesh)
+    modes = np.zeros((2, mesh.n_nodes, 3))
+    modes[1, :, 0] = z**2
+    functions = ParameterFunctions(np.zeros(1), np.ones(1), np.array([[0], [1]]), np.eye(2))
+    load = Parameter("load", "ratio", "1", 0.0, 1.0, 0.0)
+    model = ReducedModel("tube", mesh.nodes, surface.triangles, (load,), SeparatedField(modes, functions))
+    field = with_revolution_angle(model, AXIS).displacement
+    expected = z[:, None] ** 2 * np.array([np.cos(0.7), np.sin(0.7), 0.0])
+    np.testing.assert_allclose(field.value(np.array([1.0, 0.7])), expected, atol=1e-12)

@@ -95,7 +95,8 @@ def _axis_of(nodes: Array, direction: Array) -> tuple[Array, Array]:
 def _node_images(nodes: Array, point: Array, direction: Array) -> NDArray[np.int64] | None:
     """Which node (n_cells, n) is where each node comes from when the mesh is turned on by k cells of n_cells.
 
-    None if there is no number of cells for which nodes fall on nodes.
+    The outer ring has a node for each cell, or, of second order, two. None if there is no number of cells for which
+    nodes fall on nodes.
     """
     tree, allowed = KDTree(nodes), NODE_TOLERANCE * np.linalg.norm(np.ptp(nodes, axis=0))
     arms = nodes - point
@@ -103,16 +104,16 @@ def _node_images(nodes: Array, point: Array, direction: Array) -> NDArray[np.int
     radii = np.linalg.norm(arms - heights[:, None] * direction, axis=1)
     outer = int(radii.argmax())
     ring = np.flatnonzero((np.abs(heights - heights[outer]) < allowed) & (np.abs(radii - radii[outer]) < allowed))
-    count = len(ring)
-    if count < 3:
-        return None
-    images = np.empty((count, len(nodes)), dtype=np.int64)
-    for k in range(count):
-        back = Rotation.from_rotvec(-2.0 * np.pi * k / count * direction).as_matrix()
-        distance, images[k] = tree.query(arms @ back.T + point)
-        if distance.max() > allowed:
-            return None
-    return images
+    for count in (len(ring), len(ring) // 2):
+        images = np.empty((count, len(nodes)), dtype=np.int64)
+        for k in range(count):
+            back = Rotation.from_rotvec(-2.0 * np.pi * k / count * direction).as_matrix()
+            distance, images[k] = tree.query(arms @ back.T + point)
+            if distance.max() > allowed:
+                break
+        else:
+            return images if count >= 3 else None
+    return None
 
 
 def _turned(
@@ -147,7 +148,8 @@ def _harmonics_needed(modes: NDArray[np.floating]) -> int:
     energy = np.array([[np.sum(part**2, dtype=np.float64) for part in mode] for mode in modes])
     energy[:, 0] *= 2.0  # the mean square of a cosine is a half, that of the constant is 1
     total = energy.sum(axis=1, keepdims=True)
-    beyond = np.sqrt(np.cumsum(energy[:, ::-1], axis=1)[:, ::-1] / total).max(axis=0)
+    beyond = np.cumsum(energy[:, ::-1], axis=1)[:, ::-1]
+    beyond = np.sqrt(np.divide(beyond, total, out=np.zeros_like(beyond), where=total > 0.0)).max(axis=0)
     small = np.flatnonzero(beyond[1::2] <= HARMONICS_LEFT_OUT)
     return int(small[0]) if small.size else modes.shape[1] // 2
 
