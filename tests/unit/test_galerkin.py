@@ -5,10 +5,17 @@ import pytest
 from scipy.optimize import root
 from scipy.sparse import csr_matrix
 
+from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.solvers.continuation import advance
 from morph_dslam.mechanics.solvers.linear_solver import AssembledLinearisation, LinearSolver
 from morph_dslam.mechanics.solvers.newton import State, sensitivities, solve
-from morph_dslam.reduction.galerkin import GalerkinEquations, galerkin_modes, newton_correction
+from morph_dslam.reduction.galerkin import (
+    FullSolutions,
+    GalerkinEquations,
+    ReducedSolver,
+    galerkin_modes,
+    newton_correction,
+)
 
 SPRINGS = 30
 
@@ -130,3 +137,11 @@ def test_newton_correction_measures_the_error_of_a_projected_solution(projected)
 def test_modes_must_leave_prescribed_dofs_alone():
     with pytest.raises(ValueError, match="prescribed"):
         GalerkinEquations(CHAIN, np.ones((1, CHAIN.n_dofs)))
+
+
+def test_solutions_that_are_all_zero_have_no_relative_error():
+    chain = AnchoredTracker()
+    samples = np.random.default_rng(0).random((20, 3))
+    solutions = FullSolutions(samples, np.zeros((20, chain.n_dofs)), np.zeros((20, 3, chain.n_dofs)))
+    with pytest.raises(StudyError):
+        ReducedSolver(chain, solutions, np.array([[0.0, 1.0]] * 3), 1e-3)

@@ -89,6 +89,11 @@ def estimator_check(task: ReductionTask, files: Sequence[Path]) -> dict[str, Any
     ----------
     task : with the training solutions, whose modes the equations are projected on.
     files : of the held-out solutions.
+
+    Returns
+    -------
+    dict
+        Without figures where no reduced equations could be solved, or none has an error.
     """
     equations = solid_equations(task.problem() if task.problem else None)
     solver = ReducedSolver(equations, FullSolutions.read(task.files), task.box, task.options.tolerance)
@@ -100,8 +105,12 @@ def estimator_check(task: ReductionTask, files: Sequence[Path]) -> dict[str, Any
         except SolverError:
             continue
         missed = (solver.lift(reduced, mu) - truth)[solver.measured]
-        errors.append(float(np.linalg.norm(missed)) / solver.largest)
-        ratios.append(solver.estimate(reduced, mu) / errors[-1])
+        error = float(np.linalg.norm(missed)) / solver.largest
+        if error > 0.0:
+            errors.append(error)
+            ratios.append(solver.estimate(reduced, mu) / error)
+    if not ratios:
+        return {"n_held_out": 0}
     return {
         "effectivity_min": min(ratios),
         "effectivity_median": float(np.median(ratios)),

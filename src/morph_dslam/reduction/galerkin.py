@@ -153,6 +153,10 @@ PATIENCE, SLOW = 3, 0.05
 REFIT, REFIT_DEGREE = 4, 5
 #: A correction larger than this part of the largest solution is not trusted.
 TOO_LARGE = 2.0
+UNMOVED_BODY = (
+    "no solution moves the body: its loads are zero, miss it or act where it is held, or no obstacle reaches it; check "
+    "their sets, places and ranges"
+)
 
 
 @dataclass(frozen=True)
@@ -204,6 +208,11 @@ class ReducedSolver:
     tolerance : relative error that the reduction may have.
     max_degree : highest polynomial degree of the prediction.
 
+    Raises
+    ------
+    StudyError
+        If all solutions are zero, or too few to fit a prediction to.
+
     Attributes
     ----------
     galerkin : the projected equations.
@@ -217,6 +226,8 @@ class ReducedSolver:
         self.equations, self._solutions, self._box = equations, solutions, box
         self.measured = np.broadcast_to(np.isfinite(equations.scale), equations.n_dofs)
         self.largest = float(np.linalg.norm(solutions.states[:, self.measured], axis=1).max())
+        if self.largest == 0.0:  # errors would be relative to nothing
+            raise StudyError(UNMOVED_BODY)
         spread = np.diff(box, axis=1)
         vectors = np.concatenate([solutions.states, *(solutions.slopes * spread).swapaxes(0, 1)])
         self._weights = balancing_weights(vectors, self.measured)

@@ -24,6 +24,7 @@ from morph_dslam.model.stated_errors import doubtful_errors, doubtful_mesh_error
 from morph_dslam.reduction.adaptive_sampling import estimator_check
 from morph_dslam.reduction.bisection import COARSER
 from morph_dslam.reduction.certificate import certify, compression_percent, stability_warnings, typical_sizes
+from morph_dslam.reduction.galerkin import UNMOVED_BODY
 from morph_dslam.reduction.registry import ReductionMethod, reduction_method
 from morph_dslam.reduction.self_penetration import obstacle_report, penetration_report
 from morph_dslam.reduction.task import ReductionTask
@@ -63,10 +64,6 @@ MISSED = {
         "solutions, as where they change abruptly: narrow {ranges}"
     ),
 }
-UNMOVED_BODY = (
-    "no solution moves the body: its loads are zero, miss it or act where it is held, or no obstacle reaches it; check "
-    "their sets, places and ranges"
-)
 UNSURE_LOADS = (
     "responses to unknown loads are off by {:.0f} % between the states where they are known: narrow the ranges of the "
     "parameters"
