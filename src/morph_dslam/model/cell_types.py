@@ -1,9 +1,9 @@
 """Cell types: node order, faces, shape functions and quadrature of each, from one table of reference cells.
 
-Node order is VTK's (VTK User's Guide, "Cell types"), which for every type here is Abaqus's as well; the base
-triangle of a prism turns anticlockwise as seen from its top. Faces are numbered as Abaqus numbers them (S1 is
-0) and their nodes turn anticlockwise as seen from outside. Reference cells fill the unit cube, the unit
-simplex or, for prisms, the unit triangle times [0, 1].
+Node order is VTK's (VTK User's Guide, "Cell types"), which is Abaqus's as well, save that of linear prisms: the base
+triangle of a prism turns anticlockwise as seen from its top, that of VTK's linear prism the other way round. Faces are
+numbered as Abaqus numbers them (S1 is 0) and their nodes turn anticlockwise as seen from outside. Reference cells fill
+the unit cube, the unit simplex or, for prisms, the unit triangle times [0, 1].
 """
 
 from __future__ import annotations

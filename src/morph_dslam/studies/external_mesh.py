@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -12,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_checks import check_mesh, wrong_cells
+from morph_dslam.meshing.mesh_repair import reoriented
 from morph_dslam.meshing.mesh_summary import described_mesh
 from morph_dslam.meshing.meshes import CellBlock, Mesh
 from morph_dslam.studies.problem import announce
@@ -19,7 +21,7 @@ from morph_dslam.studies.solid_sections import check_unit
 from morph_dslam.studies.solution_files import SAME
 from morph_dslam.units import to_si
 
-#: Cell types by the names that meshio gives them; the order of their nodes is VTK's.
+#: Cell types by the names that meshio gives them; the order of their nodes is VTK's, or that of linear prisms ours.
 _CELL_TYPES = {
     "hexahedron": "hex8",
     "hexahedron20": "hex20",
@@ -27,7 +29,6 @@ _CELL_TYPES = {
     "tetra": "tet4",
     "tetra10": "tet10",
     "wedge": "prism6",
-    "wedge15": "prism15",
     "wedge18": "prism18",
     "triangle": "tri3",
     "quad": "quad4",
@@ -35,19 +36,27 @@ _CELL_TYPES = {
 
 
 def mesh_of(content: meshio.Mesh, unit: str, path: Path) -> Mesh:
-    """All points and the cells of the highest dimension, metres; StudyError if there are none or other types."""
-    blocks = [block for block in content.cells if block.type not in ("vertex", "line")]
+    """All points and the cells of the highest dimension, metres; StudyError if there are none or other types.
+
+    Linear prisms all of which are mirrored are turned round, for VTK lists them so and Abaqus does not.
+    """
+    highest = max((block.dim for block in content.cells), default=0)
+    blocks = [block for block in content.cells if block.dim == highest > 1]
     unknown = {block.type for block in blocks} - set(_CELL_TYPES)
     if unknown or not blocks:
         raise StudyError(
             f"{path} has {'cells of type ' + ', '.join(sorted(unknown)) if unknown else 'no cells'}; "
             f"known are {', '.join(_CELL_TYPES)}"
         )
-    made = [CellBlock(_CELL_TYPES[block.type], np.asarray(block.data, dtype=np.int64)) for block in blocks]
-    highest = max(block.type.dimension for block in made)
+    made = tuple(CellBlock(_CELL_TYPES[block.type], np.asarray(block.data, dtype=np.int64)) for block in blocks)
     nodes = np.zeros((len(content.points), 3))
     nodes[:, : content.points.shape[1]] = content.points
-    return Mesh(to_si(1.0, unit, "length") * nodes, tuple(block for block in made if block.type.dimension == highest))
+    for block in made:
+        if block.connectivity.size and not 0 <= block.connectivity.min() <= block.connectivity.max() < len(nodes):
+            raise StudyError(f"{path} has cells that refer to points which it does not hold ({len(nodes)} are there)")
+    mesh = Mesh(to_si(1.0, unit, "length") * nodes, made)
+    turned = zip(made, reoriented(mesh).blocks, strict=True)
+    return replace(mesh, blocks=tuple(new if new.cell_type == "prism6" else old for old, new in turned))
 
 
 def used_nodes(mesh: Mesh) -> NDArray[np.bool_]:

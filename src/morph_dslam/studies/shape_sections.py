@@ -92,7 +92,7 @@ class _FieldShape(_ShapeSection):
     measures: ClassVar[str] = "ratio"
 
     def moves(self, mesh: Mesh) -> Array:
-        unit, content = to_si(1.0, self.unit, "length"), read_solution(self.file)
+        unit, content = to_si(1.0, self.unit, "length"), read_solution(self.file, whole=False)
         points = np.zeros((len(content.points), 3))
         points[:, : content.points.shape[1]] = unit * content.points
         if not np.isfinite(points).all():

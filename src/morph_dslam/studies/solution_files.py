@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,11 @@ _READERS = {".vtu": meshio.vtu.read, ".vtk": meshio.vtk.read, ".xdmf": meshio.xd
 SAME = 1e-5
 
 
-def read_solution(path: Path, step: str | None = None) -> meshio.Mesh:
+def read_solution(path: Path, step: str | None = None, whole: bool = True) -> meshio.Mesh:
     """A file's mesh and point data; of an XDMF series those of one step.
 
-    Raises StudyError if it is missing, damaged or of another kind, or the step is no number from 0 on.
+    Raises StudyError if it is missing, damaged or of another kind, the step is no number from 0 on, or, where it must
+    be ``whole``, it has cells that meshio does not know and leaves out, such as voxels.
     """
     if step is not None and not step.isdecimal():
         raise StudyError(f"step '{step}' of {path} is no whole number from 0 on")
@@ -31,11 +34,23 @@ def read_solution(path: Path, step: str | None = None) -> meshio.Mesh:
         raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
     try:
         if step is None:
-            return read(str(path))
+            with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
+                content = read(str(path))
+            if whole and "cannot handle" in warnings.getvalue():
+                raise StudyError(f"{path} holds cells that are not known, such as voxels: save them as hexahedra")
+            return content
         with meshio.xdmf.TimeSeriesReader(path) as reader:
             points, cells = reader.read_points_cells()
             _, point_data, _ = reader.read_data(int(step))
             return meshio.Mesh(np.asarray(points), cells, point_data=point_data)
+    except StudyError:
+        raise
+    except KeyError as error:
+        if "wedge15" in error.args:
+            raise StudyError(
+                f"{path} holds prisms of 15 nodes, which cannot be read: save them with 18 or 6"
+            ) from error
+        raise StudyError(f"cannot read the solution {path}: {error}") from error
     except Exception as error:  # meshio raises whatever its parsers meet
         raise StudyError(f"cannot read the solution {path}: {error}") from error
 
