@@ -24,7 +24,7 @@ class SteadyTimes:
     velocity from two frames would have that as an error. The time of a frame is that of the line that fits the last
     `REMEMBERED` ones best, which counts on where frames are dropped. A frame that is not near the line has the time at
     which it was received, and so have those after it until a line holds again: no time is moved by more than
-    `MOST_OFF_S`. Times increase.
+    `MOST_OFF_S`, but for what lets times increase where several frames come at once.
     """
 
     def __init__(self) -> None:
