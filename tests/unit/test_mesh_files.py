@@ -565,3 +565,21 @@ def test_the_liver_is_read_and_its_sculpted_surface_refused():
     assert (mesh.n_nodes, mesh.n_cells) == (4293, 22019)
     with pytest.raises(StudyError, match="cuts through itself"):
         load_mesh(folder / "liver-smoothUV.obj", "cm")
+
+
+def test_gmsh_2_cells_of_two_groups_are_one_cell_in_both(tmp_path):
+    """Gmsh 2 writes the second hexahedron of the bar once for each of its groups."""
+    text = GMSH.replace("$PhysicalNames\n4", '$PhysicalNames\n5\n3 7 "core"').replace("$Elements\n4", "$Elements\n5")
+    text = text.replace("$EndElements", "5 5 2 7 2 2 3 6 5 8 9 12 11\n$EndElements")
+    (tmp_path / "bar.msh").write_text(text)
+    mesh = load_mesh(tmp_path / "bar.msh", "mm")
+    check_mesh(mesh)
+    assert cell_volumes(mesh) == pytest.approx([1e-6, 1e-6], rel=1e-12)
+    assert {name: cells.tolist() for name, cells in mesh.cell_sets.items()} == {"soft": [0], "hard": [1], "core": [1]}
+    assert surface_area(mesh, "grip") == pytest.approx(1e-4, rel=1e-12)
+
+
+def test_gmsh_4_0_which_keeps_one_group_of_an_entity_is_refused(tmp_path):
+    (tmp_path / "bar.msh").write_text(gmsh_4_text(first_groups="1 1").replace("4.1 0 8", "4 0 8"))
+    with pytest.raises(StudyError, match=r"version 4\.0"):
+        load_mesh(tmp_path / "bar.msh", "mm")

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -167,13 +168,45 @@ def _read_with_meshio(path: Path) -> Mesh:
     if unknown:
         raise StudyError(f"{path} holds {', '.join(unknown)} cells, which are not known; use {', '.join(_CELLS)}")
     blocks = [CellBlock(_CELLS[content.cells[i].type], content.cells[i].data.astype(np.int64)) for i in top]
+    groups = content.cell_data.get("gmsh:physical")
+    starts = Mesh(content.points, tuple(blocks)).block_starts()
+    numbers = [np.arange(start, end) for start, end in pairwise(starts)]
+    if groups is not None:
+        blocks, numbers = _without_copies(blocks, [groups[i] for i in top])
     nodes = np.zeros((len(content.points), 3))
     nodes[:, : content.points.shape[1]] = content.points
     mesh = Mesh(nodes, tuple(blocks))
     for block in blocks:
         if block.connectivity.size and not 0 <= block.connectivity.min() <= block.connectivity.max() < len(nodes):
             raise StudyError(f"{path} has cells that refer to nodes which it does not hold ({len(nodes)} are there)")
-    return _with_groups(mesh, content, top, dimension, path)
+    return _with_groups(mesh, content, dict(zip(top, numbers, strict=True)), dimension, path)
+
+
+def _without_copies(blocks: list[CellBlock], groups: Sequence[Indices]) -> tuple[list[CellBlock], list[Indices]]:
+    """The blocks with each cell once, and for each block as it was the numbers of its cells.
+
+    Gmsh 2 writes a cell once for each physical group that it belongs to; ``groups`` (m,) of each block are their tags.
+    Copies in one group are left for `check_mesh` to refuse.
+    """
+    sizes = [len(block.connectivity) for block in blocks]
+    first = np.arange(sum(sizes))
+    kind = np.repeat([block.cell_type for block in blocks], sizes)
+    for name in set(kind):
+        rows = np.flatnonzero(kind == name)
+        cells = np.concatenate([block.connectivity for block in blocks if block.cell_type == name])
+        tags = np.concatenate([tag for tag, block in zip(groups, blocks, strict=True) if block.cell_type == name])
+        _, index, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        if len(np.unique(np.column_stack([inverse.ravel(), tags]), axis=0)) == len(cells):
+            first[rows] = rows[index[inverse.ravel()]]
+    kept = first == np.arange(len(first))
+    numbers = (np.cumsum(kept) - 1)[first]
+    ends = np.cumsum(sizes)[:-1]
+    single = [
+        CellBlock(block.cell_type, block.connectivity[mask])
+        for block, mask in zip(blocks, np.split(kept, ends), strict=True)
+        if mask.any()
+    ]
+    return single, list(np.split(numbers, ends))
 
 
 def _read(path: Path) -> Any:
@@ -181,7 +214,7 @@ def _read(path: Path) -> Any:
     kind = file_kind(path)
     try:
         if kind == ".msh":
-            _check_sections_closed(path)
+            _check_gmsh(path)
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
             content = readers[kind](str(path))
     except OSError as error:
@@ -215,9 +248,11 @@ def _damaged(path: Path, error: Exception) -> StudyError:
     return StudyError(f"{path} is damaged, cut short, or no {file_kind(path)} file ({type(error).__name__}: {error})")
 
 
-def _check_sections_closed(path: Path) -> None:
-    """Meshio only warns where a Gmsh file ends inside a section."""
+def _check_gmsh(path: Path) -> None:
+    """Meshio only warns where a Gmsh file ends inside a section, and reads one group of an entity from version 4.0."""
     content = path.read_bytes()
+    if re.search(rb"^\$MeshFormat\s+4(\.0)?\s", content, re.MULTILINE):
+        raise StudyError(f"{path} is of version 4.0 of Gmsh's format, which is not read: save it as version 4.1 or 2.2")
     for name in re.findall(rb"^\$(MeshFormat|PhysicalNames|Entities|Nodes|Elements)\s*$", content, re.MULTILINE):
         if not re.search(rb"^\$End" + name + rb"\s*$", content, re.MULTILINE):
             line = content[: content.index(b"$" + name)].count(b"\n") + 1
@@ -267,14 +302,14 @@ def _any_dimension(name: str) -> int:
     return cell_type(_CELLS[name]).dimension if name in _CELLS else _BOUNDING[name]
 
 
-def _with_groups(mesh: Mesh, content: Any, top: list[int], dimension: int, path: Path) -> Mesh:
-    starts = dict(zip(top, mesh.block_starts()[:-1], strict=True))
+def _with_groups(mesh: Mesh, content: Any, numbers: dict[int, Indices], dimension: int, path: Path) -> Mesh:
+    """The mesh with the groups of its file; ``numbers`` are those of the cells of each block that it has them from."""
     node_sets: dict[str, Indices] = {}
     cell_sets: dict[str, Indices] = {}
     surfaces: dict[str, Indices] = {}
     for name, parts in _groups(content):
         rows = [(i, part) for i, part in enumerate(parts) if len(part)]
-        cells = [starts[i] + part for i, part in rows if i in starts]
+        cells = [numbers[i][part] for i, part in rows if i in numbers]
         if cells:
             cell_sets[name] = np.concatenate(cells)
             continue
