@@ -125,6 +125,18 @@ def test_samples_gather_where_the_function_bends(tmp_path: Path) -> None:
     assert len(samples) == rounds[-1]["solves"] < 20
 
 
+@pytest.mark.parametrize(("basis", "counts"), [(None, 9), ("hat", 33)])
+def test_middles_are_predicted_by_the_functions_of_the_model(tmp_path: Path, basis: str | None, counts: int) -> None:
+    """A parabola: cubics meet it, hats miss middles of intervals h by h²/4, which the last round has below 1e-3."""
+    chosen = study()
+    chosen = chosen.model_copy(
+        update={"reduction": chosen.reduction.model_copy(update={"basis": basis, "tolerance": 1e-3})}
+    )
+    samples, rounds = sample_by_bisection(chosen, sweep_of(lambda t: (t**2, 2.0 * t), chosen, tmp_path))
+    assert len(samples) == counts
+    assert rounds[-1]["largest_estimate"] == pytest.approx(0.0 if basis is None else 1.0 / 16.0**2 / 4.0, abs=1e-6)
+
+
 def test_sampling_ends_at_the_most_samples_and_leaves_what_cannot_be_solved(tmp_path: Path) -> None:
     chosen = study(training=11)
     samples, _ = sample_by_bisection(

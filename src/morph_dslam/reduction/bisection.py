@@ -1,10 +1,11 @@
 """Sampling a single parameter by bisection: full solves where interpolation between those so far errs most.
 
 Each interval between two samples is checked by a solve in its middle, predicted by the functions that the model will
-use (`line_functions`). Where the prediction misses by more than the tolerance, both halves are checked too. Stress and
-the forces of supports may miss by `COARSER` times as much: they count where the displacement hardly changes, as that of
-a viscous body that is held. The middle becomes a sample of the model, which so errs less than was measured: for a
-smooth function by a sixteenth of it. Where solutions jump it errs by as much as before, only in a shorter interval.
+use, piecewise cubics or those that the study names (`line_functions`). Where the prediction misses by more than the
+tolerance, both halves are checked too. Stress and the forces of supports may miss by `COARSER` times as much: they
+count where the displacement hardly changes, as that of a viscous body that is held. The middle becomes a sample of the
+model, which so errs less than was measured: for a smooth function by a sixteenth of it, with hats by a quarter. Where
+solutions jump it errs by as much as before, only in a shorter interval.
 Which samples are taken depends on solutions alone: a build that was stopped takes them again and finds them on disk.
 """
 
@@ -19,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.reduced_model import FORCE, REACTION
-from morph_dslam.reduction.line_functions import interpolate_line
+from morph_dslam.reduction.line_functions import LINE_BASES, interpolate_line
 from morph_dslam.reduction.task import STRESS
 from morph_dslam.studies.problem import ParametricStudy, Snapshot
 from morph_dslam.studies.sampling import first_samples
+from morph_dslam.studies.sections import BasisName
 from morph_dslam.studies.snapshots import load_snapshot
 from morph_dslam.studies.sweep import SweepResult
 
@@ -94,6 +96,8 @@ def sample_by_bisection(
     "steady" where the error does not fall in ever shorter intervals.
     """
     weights, tolerance = study.model_mesh().weights, study.reduction.tolerance
+    # Polynomials are fitted to all samples together; splines through them tell where these are too few.
+    basis = study.reduction.basis if study.reduction.basis in LINE_BASES else None
     samples = first_samples(study)
     solved = sweep(samples).solved
     waiting = [_Interval(float(low), float(high)) for low, high in pairwise(samples[:, 0])]
@@ -106,7 +110,7 @@ def sample_by_bisection(
         waiting = waiting[:room]
         if not waiting:
             break
-        lines = _Lines([load_snapshot(path) for _, path in sorted(solved.items())], weights)
+        lines = _Lines([load_snapshot(path) for _, path in sorted(solved.items())], weights, basis)
         samples = np.vstack([samples, [[interval.middle] for interval in waiting]])
         solved = sweep(samples).solved
         new = range(len(samples) - len(waiting), len(samples))
@@ -121,7 +125,7 @@ def sample_by_bisection(
         waiting = [half for half in halves if half.high - half.low > least or not half.steady]
         reasons |= {half: "steady" for half in halves if half not in waiting}
     if reasons:
-        lines = _Lines([load_snapshot(path) for _, path in sorted(solved.items())], weights)
+        lines = _Lines([load_snapshot(path) for _, path in sorted(solved.items())], weights, basis)
         if found := _unresolved(reasons, lines.displacement, least):
             rounds[-1]["unresolved"] = found
     return samples, rounds
@@ -156,13 +160,17 @@ def _unresolved(missed: Mapping[_Interval, str], line: _Line, least: float) -> l
 
 
 class _Lines:
-    """Displacement, stress and forces between snapshots of one parameter; ``weights`` (n,) are those of the nodes."""
+    """Displacement, stress and forces between snapshots of one parameter; ``weights`` (n,) are those of the nodes.
 
-    def __init__(self, snapshots: Sequence[Snapshot], weights: Array) -> None:
-        self.displacement = _Line(snapshots, "displacement", weights)
+    ``basis`` is that of `interpolate_line`.
+    """
+
+    def __init__(self, snapshots: Sequence[Snapshot], weights: Array, basis: BasisName | None) -> None:
+        self.displacement = _Line(snapshots, "displacement", weights, basis)
         names = [name for name in snapshots[0].fields if name.startswith(STRESS)]
-        self._stresses = [_Line(snapshots, name, weights) for name in names]
-        self._forces = [_Line(snapshots, name, np.ones(1)) for name in snapshots[0].outputs if name.startswith(FORCE)]
+        self._stresses = [_Line(snapshots, name, weights, basis) for name in names]
+        forces = [name for name in snapshots[0].outputs if name.startswith(FORCE)]
+        self._forces = [_Line(snapshots, name, np.ones(1), basis) for name in forces]
 
     def error(self, snapshot: Snapshot) -> _Error:
         """That at another snapshot which counts most."""
@@ -186,9 +194,10 @@ class _Line:
     ----------
     name : of a field or an output.
     weights : (n,) of the places where it has values.
+    basis : of `interpolate_line`.
     """
 
-    def __init__(self, snapshots: Sequence[Snapshot], name: str, weights: Array) -> None:
+    def __init__(self, snapshots: Sequence[Snapshot], name: str, weights: Array, basis: BasisName | None) -> None:
         self._name = name
         points = np.array([snapshot.coordinates[0] for snapshot in snapshots])
         values = np.array([_values_of(snapshot, name) for snapshot in snapshots])
@@ -197,7 +206,7 @@ class _Line:
         self._weights = np.repeat(weights, values.shape[1] // len(weights))
         self._slopes = np.array(slopes, dtype=np.float64) if slopes else None
         self._points, self._values = points, values
-        self._functions = interpolate_line(points, values, self._slopes)
+        self._functions = interpolate_line(points, values, self._slopes, basis)
         #: Norm; zero for a body that has not moved yet.
         self.largest = max(self._norm(value) for value in values)
 

@@ -15,6 +15,8 @@ from morph_dslam.model.tensor_functions import TensorTrainFunctions
 from morph_dslam.studies.sections import BasisName
 
 Array = NDArray[np.float64]
+#: Functions that a study may name for its single parameter.
+LINE_BASES = ("cubic_spline", "hat")
 #: Least samples that cubic splines can interpolate.
 LEAST = 4
 #: Distance of a sample from an end of the range, over the range, that is rounding.
