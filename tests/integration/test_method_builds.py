@@ -15,8 +15,10 @@ from morph_dslam.errors import SolverError, StudyError
 from morph_dslam.mechanics.solvers.continuation import PathError
 from morph_dslam.model import load_model
 from morph_dslam.reduction import galerkin
+from morph_dslam.studies import solutions
 from morph_dslam.studies.build import build_warnings
 from morph_dslam.studies.defaults import resolve_defaults
+from morph_dslam.studies.sampling import training_samples
 from tests.support.block_study import STUDY, bent_block, write_study
 
 BLOCK = bent_block(["20 mm", "20 mm", "60 mm"], [2, 2, 6], 0.4, "25 deg", "5 mm") | {
@@ -85,6 +87,17 @@ def test_a_default_method_without_reduced_solutions_gives_way_to_pod(tmp_path, m
     assert np.abs(moved - led).max() < 1e-4
     with pytest.raises(StudyError, match=r'"galerkin" failed: .* Use reduction\.method = "pod"'):
         build(make_study(study | {"reduction": {"method": "galerkin"}}), tmp_path / "block.morph")
+
+
+def test_what_takes_the_place_of_a_method_has_all_samples_that_the_study_allows(tmp_path, monkeypatch) -> None:
+    """Adaptive sampling ends with the first six, of which regression alone makes a poor model."""
+    lose_reduced_solutions(monkeypatch)
+    monkeypatch.setattr(solutions, "sample_adaptively", lambda study, *_: (training_samples(study), []))
+    sampling = {"first": 6, "training": 12, "held_out": 4, "refined": 0}
+    study = BLOCK | {"solver": {"threads": 1, "workers": 1}, "sampling": sampling, "reduction": {}}
+    model = build(make_study(study), tmp_path / "block.morph")
+    assert model.certificate["reduction"]["method"] == "pod"
+    assert model.certificate["samples"]["training"] == 12
 
 
 def test_a_build_reduces_in_its_own_threads_where_all_samples_are_found(tmp_path) -> None:

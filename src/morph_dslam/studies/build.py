@@ -141,9 +141,7 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
             first = len(time_instants(chosen))
         most = f"sampling: at most {chosen.sampling.training} solves, {first} of them first and more "
         announce(f"{most}where the error is large; then {chosen.sampling.held_out} held-out ones")
-    snapshots = take_snapshots(chosen, _kept_in(output), workers, executor)
-    _check_held_out(chosen, snapshots, output)
-    model = certified_model(snapshots, chosen.reduction, chosen.name, _fallback(study.reduction))
+    snapshots, model = _solved(chosen, output, workers, executor, _may_fall_back(study.reduction))
     if isinstance(chosen, SolidStudy) and any(section.kind != "surface" for section in chosen.contacts):
         solutions = [*(group[0] for group in snapshots.training), *snapshots.held_out]
         model.certificate["obstacle_penetration"] = obstacle_report(
@@ -166,6 +164,25 @@ def _built(study: Study, text: str, output: Path, workers: int | None, executor:
     with writing(StudyError, output):
         save_model(output, model)
     return model
+
+
+def _solved(
+    study: Study, output: Path, workers: int | None, executor: Executor | None, may_fall_back: bool
+) -> tuple[Snapshots, ReducedModel]:
+    """The solutions of a study and their certified model, by another method if its own fails and it may."""
+    snapshots = take_snapshots(study, _kept_in(output), workers, executor)
+    _check_held_out(study, snapshots, output)
+    try:
+        return snapshots, certified_model(snapshots, study.reduction, study.name)
+    except _UnsolvedReduction as error:
+        if not may_fall_back:
+            raise
+        reason = error.replaced
+    announce(reason)
+    snapshots, model = _solved(_with_fallback(study), output, workers, executor, may_fall_back=False)
+    summary = model.certificate["reduction"]
+    summary["warnings"] = [*summary.get("warnings", []), reason]
+    return snapshots, model
 
 
 def _kept_in(output: Path) -> Path:
@@ -310,9 +327,20 @@ def _check_held_out(study: Study, snapshots: Snapshots, output: Path) -> None:
     )
 
 
-def certified_model(
-    snapshots: Snapshots, options: ReductionSection, name: str, fallback: str | None = None
-) -> ReducedModel:
+class _UnsolvedReduction(StudyError):
+    """A method whose reduced equations cannot be solved.
+
+    Attributes
+    ----------
+    replaced : what is said where another method takes its place.
+    """
+
+    def __init__(self, method: str, reason: SolverError) -> None:
+        super().__init__(UNSOLVED_REDUCTION.format(method, reason))
+        self.replaced = f'method "{method}" failed, "{FALLBACK}" took its place: {reason}'
+
+
+def certified_model(snapshots: Snapshots, options: ReductionSection, name: str) -> ReducedModel:
     """The reduced model of the training solutions, with its errors at the held-out ones.
 
     Parameters
@@ -320,19 +348,19 @@ def certified_model(
     snapshots : training and held-out solutions.
     options : how to reduce them.
     name : of the model.
-    fallback : method in place of one whose reduced equations cannot be solved; None if there shall be no other.
 
     Raises
     ------
     StudyError
-        If the method does not suit the solutions, or what it returns is not their model.
+        If the method does not suit the solutions, its reduced equations cannot be solved, or what it returns is not
+        their model.
     """
     training, held_out = snapshots.training, snapshots.held_out
     method = reduction_method(options.method or "pod")
     task = ReductionTask(
         snapshots.mesh, snapshots.parameters, training, options, name, snapshots.problem, snapshots.training_files
     )
-    model, method = _reduced(task, method, fallback)
+    model = _reduced(task, method)
     announce(f"measuring errors at {len(held_out)} held-out solutions")
     # Nobody knows how another program's states lie in the box.
     sizes = typical_sizes(model, snapshots.coordinates)
@@ -351,28 +379,29 @@ def certified_model(
     return model
 
 
-def _fallback(asked: ReductionSection) -> str | None:
-    """The method that may stand in for the default one; None if the study asks for a method or for functions."""
-    return FALLBACK if asked.method is asked.format is asked.basis is None else None
+def _may_fall_back(asked: ReductionSection) -> bool:
+    """Whether another method may stand in for the default one: the study asks for none, nor for functions."""
+    return asked.method is asked.format is asked.basis is None
 
 
-def _reduced(
-    task: ReductionTask, method: ReductionMethod, fallback: str | None
-) -> tuple[ReducedModel, ReductionMethod]:
-    """The model of a task and the method that has made it (`certified_model`)."""
+def _with_fallback(study: Study) -> Study:
+    """The same study with the method that needs no reduced equations, and as many solutions as may be.
+
+    Those of adaptive sampling are as few as the projected equations need; what fits functions to them needs more.
+    """
+    changes: dict[str, Any] = {"reduction": study.reduction.model_copy(update={"method": FALLBACK})}
+    if not isinstance(study, ExternalStudy) and study.sampling.scheme == "adaptive":
+        changes["sampling"] = study.sampling.model_copy(update={"scheme": "sobol"})
+    return study.model_copy(update=changes)
+
+
+def _reduced(task: ReductionTask, method: ReductionMethod) -> ReducedModel:
+    """The model of a task (`certified_model`)."""
     announce(f"reducing {len(task.groups)} solutions by method {method.name}")
     try:
-        return _checked(method.reduce(task), task, method.name), method
+        return _checked(method.reduce(task), task, method.name)
     except SolverError as error:
-        if fallback is None:
-            raise StudyError(UNSOLVED_REDUCTION.format(method.name, error)) from error
-        reason = f'method "{method.name}" failed, "{fallback}" took its place: {error}'
-    announce(reason)
-    other = replace(task, options=task.options.model_copy(update={"method": fallback}))
-    model, method = _reduced(other, reduction_method(fallback), None)
-    summary = model.certificate["reduction"]
-    summary["warnings"] = [*summary.get("warnings", []), reason]
-    return model, method
+        raise _UnsolvedReduction(method.name, error) from error
 
 
 def _checked(model: object, task: ReductionTask, method: str) -> ReducedModel:
