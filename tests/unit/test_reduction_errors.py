@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from morph_dslam.model import SeparatedField
+from morph_dslam.model.basis_functions import fourier_basis
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.model.reduction_errors import ReductionErrors, errors_on_modes
+from morph_dslam.model.tensor_functions import CPFunctions
 from tests.support.stretched_block import SIZE, stretched_block_model
 
 #: Held-out states, SI, and the parameters' changes that are the model's error there.
@@ -170,3 +172,15 @@ def test_errors_of_other_modes_do_not_count(model):
         known, displacement=field.with_modes(np.concatenate([0.5 * field.modes, 0.5 * field.modes], axis=0))
     )
     assert ReductionErrors.of(halves) is None
+
+
+def test_of_an_angle_that_begins_again_states_beyond_the_end_are_near():
+    """At 350 degrees a state at 10 degrees is nearer than one at 180; half the weight goes by squared distances."""
+    circle = 2.0 * np.pi
+    functions = CPFunctions((fourier_basis(0.0, circle, 1),), (np.eye(3),), np.eye(3))
+    states, sizes = np.radians([[10.0], [180.0]]), np.array([1e-3, 3e-3])
+    errors = ReductionErrors(states, np.zeros((2, 3)), sizes, np.zeros(1), np.array([circle]), functions, np.eye(3))
+    near = 170.0**2 / (20.0**2 + 170.0**2)
+    expected = np.sqrt((0.5 * near + 0.25) * 1e-6 + (0.5 * (1.0 - near) + 0.25) * 9e-6)
+    for degrees in (350.0, -10.0, 710.0):
+        assert errors.size_at(np.radians([degrees])) == pytest.approx(expected, rel=1e-9)

@@ -124,7 +124,9 @@ class ReductionErrors:
 
         A model is often poor in one corner of its box only; but one good state does not make its surroundings good.
         """
-        nearness = 1.0 / np.maximum(np.sum(((self.states - mu) / self.ranges) ** 2, axis=1), SAME_STATE**2)
+        apart = (self.states - mu) / self.ranges
+        apart -= np.where(self._periodic, np.rint(apart), 0.0)
+        nearness = 1.0 / np.maximum(np.sum(apart**2, axis=1), SAME_STATE**2)
         return np.asarray(0.5 * (nearness / nearness.sum() + 1.0 / len(nearness)))
 
     def _effects(self, mu: Array) -> Array:
@@ -186,7 +188,13 @@ class ReductionErrors:
 
     def _places(self, mu: Array) -> Array:
         """Where in its range each parameter is at a state (d,), from 0 to 1."""
-        return np.asarray(np.clip((mu - self.lower) / self.ranges, 0.0, 1.0))
+        places = (mu - self.lower) / self.ranges
+        return np.asarray(np.where(self._periodic, places % 1.0, np.clip(places, 0.0, 1.0)))
+
+    @property
+    def _periodic(self) -> NDArray[np.bool_]:
+        """Which parameters (d,) are angles that begin again at the end of their range."""
+        return np.isinf(self.functions.bounds[0])
 
     @cached_property
     def _variances(self) -> dict[bytes, tuple[Array, Array]]:
