@@ -84,6 +84,27 @@ def test_the_contour_of_a_sphere_is_its_tangent_cone():
         assert np.diff(angles).max() < 4 * 2.0 * np.pi / len(pixels)
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.1, 0.25, 0.4, 0.55])
+def test_points_on_straight_rims_are_as_far_apart_as_asked_whatever_the_rounding(angle):
+    """Rims of 400 and 240 pixels, 1280 in all, hold 160 points 8 pixels apart: exactly 4 steps between candidates.
+
+    A bend of the long rims by a twentieth of a pixel leaves that as it is.
+    """
+    turn = rotation_exp(np.array([0.0, 0.0, angle]))
+    state = State(np.zeros(1), RigidTransform(turn, np.array([0.0003, 0.0002, 0.52])))
+    triangles = np.array([[0, 4, 3], [4, 5, 3], [4, 1, 5], [1, 2, 5]])
+    corners = [[-0.2, -0.12, 0.0], [0.2, -0.12, 0.0], [0.2, 0.12, 0.0], [-0.2, 0.12, 0.0]]
+    for bend in (0.0, 5e-5):
+        middles = [[0.0, -0.12 - bend, 0.0], [0.0, 0.12 + bend, 0.0]]
+        pixels, normals = expected(rigid(np.array([*corners, *middles]), triangles), state)
+        assert len(pixels) == 160
+        away, across = (pixels - [320.3, 240.2]) @ turn[:2, :2], normals @ turn[:2, :2]
+        for along, outwards, count in ((0, -1.0, 50), (0, 1.0, 50), (1, -1.0, 30), (1, 1.0, 30)):
+            places = np.sort(away[outwards * across[:, 1 - along] > 0.9, along])
+            assert len(places) == count
+            np.testing.assert_allclose(np.diff(places), 8.0, atol=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ground", [30.0, 90.0], ids=["as bright as the rim", "as bright as within"])
 def test_the_outline_of_a_shaded_ball_is_where_it_turns_away(ground):

@@ -106,8 +106,7 @@ def find_contour(
     """
     occluders = np.empty((0, 0), dtype=np.float32) if occluder_depth is None else occluder_depth
     rows, shares, places, normals, turns_away = _candidates(edges.nodes, nodes, pixels, depth, occluders, focal, size)
-    apart = STEP_PX * len(rows) / max(count, 1)
-    chosen = _spread(places, normals, apart, count)
+    chosen = _spread(places, normals, len(rows) / max(count, 1), count)
     rows, shares = rows[chosen], shares[chosen]
     weights = np.zeros((len(rows), 3))
     every = np.arange(len(rows))
@@ -220,14 +219,15 @@ def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
 
 @njit(cache=True, nogil=True)
 def _spread(places, normals, apart, most):
-    """Indices of at most ``most`` candidates, none nearer to another of its direction than nearly ``apart`` pixels.
+    """Indices of at most ``most`` candidates, none nearer to another of its direction than about ``apart`` steps.
 
-    The distance shrinks until most of what fits is found.
+    The distance shrinks until most of what fits is found. Along a straight stretch candidates are whole steps apart,
+    but for rounding and a slight bend. So the least distance lies midway between two numbers of steps.
     """
     chosen = np.empty(most, np.int64)
     count = 0
     for factor in (1.0, 0.75, 0.5):
-        least = (factor * apart) ** 2
+        least = (STEP_PX * (np.ceil(factor * apart) - 0.5)) ** 2
         for j in range(len(places)):
             if count == most:
                 break
