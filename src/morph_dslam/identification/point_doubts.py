@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.stats import qmc
 
 from morph_dslam.better_fit import chance_of_better_fit
@@ -113,7 +113,7 @@ def _moved_as_one(misfit: Misfit, points: MeasuredPoints) -> dict[str, float] | 
 def _markers(points: MeasuredPoints) -> NDArray[np.int64]:
     """A label of each row (r,): rows are of one marker where their places are the same but for their own error."""
     size = float(np.linalg.norm(np.ptp(points.model.nodes, axis=0)))
-    pairs = cKDTree(points.places).query_pairs(ONE_PLACE * size, output_type="ndarray")
+    pairs = KDTree(points.places).query_pairs(ONE_PLACE * size, output_type="ndarray")
     rows = len(points.places)
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(rows, rows))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
