@@ -33,7 +33,7 @@ def points(seed: int = 0, rows: tuple[int, ...] = (0, 1, 2, 3), beside: float = 
 
 
 def figures(table: MeasuredPoints) -> tuple[dict[str, Any], str]:
-    """Of the table, and what is said."""
+    """Of the table, and the lines that are printed."""
     found = summarise(identify(table.model, [table], ["a"]))
     return found["measurements"][0], "\n".join(identification_lines(found))
 

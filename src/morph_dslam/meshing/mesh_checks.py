@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,20 @@ def check_mesh(mesh: Mesh, sets: Iterable[str] = (), regions: Iterable[str] = ()
     for name in regions:
         if not len(mesh.cells(name)):
             raise StudyError(f"the cell set '{name}' is empty; name a set that holds cells")
+
+
+def check_corners(corners: Indices, n_points: int, path: Path, what: str = "cells", points: str = "nodes") -> None:
+    """Raise StudyError unless cells refer to points that a file holds.
+
+    Parameters
+    ----------
+    corners : of the cells, numbers of points, in any shape.
+    n_points : how many the file holds.
+    path : of the file.
+    what, points : what the message calls the cells and the points.
+    """
+    if corners.size and not 0 <= corners.min() <= corners.max() < n_points:
+        raise StudyError(f"{path} has {what} that refer to {points} which it does not hold ({n_points} are there)")
 
 
 def _check_arrays(mesh: Mesh) -> None:

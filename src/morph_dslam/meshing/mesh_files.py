@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
+from morph_dslam.meshing.mesh_checks import check_corners
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_found_surfaces
 from morph_dslam.meshing.netgen_meshing import (
@@ -177,8 +178,7 @@ def _read_with_meshio(path: Path) -> Mesh:
     nodes[:, : content.points.shape[1]] = content.points
     mesh = Mesh(nodes, tuple(blocks))
     for block in blocks:
-        if block.connectivity.size and not 0 <= block.connectivity.min() <= block.connectivity.max() < len(nodes):
-            raise StudyError(f"{path} has cells that refer to nodes which it does not hold ({len(nodes)} are there)")
+        check_corners(block.connectivity, len(nodes), path)
     return _with_groups(mesh, content, dict(zip(top, numbers, strict=True)), dimension, path)
 
 

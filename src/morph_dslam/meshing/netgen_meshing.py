@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.meshing.mesh_checks import check_extent, described_extent
+from morph_dslam.meshing.mesh_checks import check_corners, check_extent, described_extent
 from morph_dslam.meshing.meshes import CellBlock, Mesh, end_surfaces, find_faces
 from morph_dslam.meshing.surface_repair import repaired_surface, surface_parts
 
@@ -64,8 +64,7 @@ def read_surface(path: Path) -> _TriangleSurface:
         raise StudyError(f"{path} holds no faces; it is no closed surface, or is cut short")
     if not np.isfinite(points).all():
         raise StudyError(f"{path} holds coordinates that are not finite")
-    if not 0 <= triangles.min() <= triangles.max() < len(points):
-        raise StudyError(f"{path} has faces that refer to points which it does not hold ({len(points)} are there)")
+    check_corners(triangles, len(points), path, "faces", "points")
     points, merged = np.unique(points, axis=0, return_inverse=True)
     triangles = merged.ravel()[triangles]
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)

@@ -20,6 +20,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.model.basis_functions import CHEBYSHEV, fill_basis
+from morph_dslam.row_products import row_products
 
 Array = NDArray[np.float64]
 
@@ -122,20 +123,6 @@ def _fill_products(tables, degrees, first, end, products, chosen):
                     line[t] *= chosen[t]
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _dots(a, b, c, first, second):
-    """Sums of the products, in any order, of each of three rows and each of two."""
-    a1, a2, b1, b2, c1, c2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(len(first)):
-        a1 += a[i] * first[i]
-        a2 += a[i] * second[i]
-        b1 += b[i] * first[i]
-        b2 += b[i] * second[i]
-        c1 += c[i] * first[i]
-        c2 += c[i] * second[i]
-    return a1, a2, b1, b2, c1, c2
-
-
 @njit(cache=True, nogil=True)
 def evaluate_polynomials(mu, lower, upper, degrees, first_term, first_function, functions, coefficients):
     """Values and gradient (1 + d, n) of sums of products of Chebyshev polynomials, compiled.
@@ -172,7 +159,7 @@ def evaluate_polynomials(mu, lower, upper, degrees, first_term, first_function, 
             for row in range(0, 1 + d, 3):
                 r, s = min(row + 1, d), min(row + 2, d)
                 (result[row, one], result[row, two], result[r, one], result[r, two], result[s, one], result[s, two]) = (
-                    _dots(products[row], products[r], products[s], of_one, of_other)
+                    row_products(products[row], products[r], products[s], of_one, of_other)
                 )
     return result
 

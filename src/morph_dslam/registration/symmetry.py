@@ -67,7 +67,7 @@ def turns_alike(nodes: Array, triangles: NDArray[np.int64], axis: Axis | None) -
 def _fits(about: Axis, angle: float, nodes: Array, triangles: NDArray[np.int64], surface: Surface) -> bool:
     """Whether all of a surface, turned about an axis by an angle (rad), is on itself up to the tolerance."""
     allowed = SYMMETRY_TOLERANCE * surface.size
-    # Most nodes and most turns are told by samples of the surface, which are no farther apart than some spacings.
+    # Samples of the surface, no farther apart than some spacings, decide for most nodes and most turns.
     spacing = float(np.median(surface.tree.query(surface.points[::10], k=2)[0][:, 1]))
     turned = about.turned(nodes[np.unique(triangles)], angle)
     off = surface.tree.query(turned)[0]

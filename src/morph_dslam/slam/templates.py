@@ -15,9 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.row_products import FAST
 from morph_dslam.slam.bundle_adjustment import LEAST_DEPTH
 from morph_dslam.slam.options import PATCH_HALF
-from morph_dslam.tracking.patches import FAST, FLOW_WINDOW, LEVELS, NEUTRAL
+from morph_dslam.tracking.patches import FLOW_WINDOW, LEVELS, NEUTRAL
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -332,7 +332,7 @@ class _UnsolvedReduction(StudyError):
 
     Attributes
     ----------
-    replaced : what is said where another method takes its place.
+    replaced : the warning where another method takes its place.
     """
 
     def __init__(self, method: str, reason: SolverError) -> None:

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.mesh_checks import check_mesh, wrong_cells
+from morph_dslam.meshing.mesh_checks import check_corners, check_mesh, wrong_cells
 from morph_dslam.meshing.mesh_repair import reoriented
 from morph_dslam.meshing.mesh_summary import described_mesh
 from morph_dslam.meshing.meshes import CellBlock, Mesh
@@ -52,8 +52,7 @@ def mesh_of(content: meshio.Mesh, unit: str, path: Path) -> Mesh:
     nodes = np.zeros((len(content.points), 3))
     nodes[:, : content.points.shape[1]] = content.points
     for block in made:
-        if block.connectivity.size and not 0 <= block.connectivity.min() <= block.connectivity.max() < len(nodes):
-            raise StudyError(f"{path} has cells that refer to points which it does not hold ({len(nodes)} are there)")
+        check_corners(block.connectivity, len(nodes), path, points="points")
     mesh = Mesh(to_si(1.0, unit, "length") * nodes, made)
     turned = zip(made, reoriented(mesh).blocks, strict=True)
     return replace(mesh, blocks=tuple(new if new.cell_type == "prism6" else old for old, new in turned))

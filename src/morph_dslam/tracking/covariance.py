@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.tracking.patches import FAST
+from morph_dslam.row_products import FAST
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]

@@ -17,8 +17,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.row_products import FAST
 from morph_dslam.tracking.measurement import PATCH_HALF, PATCH_WINDOW
-from morph_dslam.tracking.patches import FAST, fill_patch
+from morph_dslam.tracking.patches import fill_patch
 
 Array = NDArray[np.float64]
 #: Blur over shorter paths, root mean square, pixels, does no harm: matching averages over a window three times as wide.

@@ -16,11 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.row_products import FAST
+
 Array = NDArray[np.float64]
 #: A step longer than this, pixels, is no correction.
 LONGEST_STEP = 1.0
-#: Sums may be taken in any order: half the time.
-FAST = {"reassoc", "contract", "nsz"}
 #: Grey level of a pixel that equals its neighbourhood's mean.
 NEUTRAL = 128
 

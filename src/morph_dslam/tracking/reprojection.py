@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from morph_dslam.model.separated import combine_modes
-from morph_dslam.tracking.patches import FAST
+from morph_dslam.row_products import FAST, row_products
 
 #: Points nearer to the camera plane than this, in metres, or behind it cannot be seen.
 MINIMUM_DEPTH = 1e-3
@@ -114,27 +114,18 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
 def products_of_rows(rows):
     """``rows`` (n, m) times their transpose, (n, n), with the products added up in any order.
 
-    Three rows times two at a pass: a number that is read then counts for several products.
+    Three rows times two at a pass.
     """
-    n, m = rows.shape
+    n = len(rows)
     result = np.empty((n, n))
     for a in range(0, n, 3):
         # Rows that are not there are taken to be the last one, whose products are then written again.
         a1, a2 = min(a + 1, n - 1), min(a + 2, n - 1)
-        p, q, r = rows[a], rows[a1], rows[a2]
         for b in range(0, a2 + 1, 2):
             b1 = min(b + 1, n - 1)
-            s, t = rows[b], rows[b1]
-            ps, pt, qs, qt, rs, rt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(m):
-                ps += p[k] * s[k]
-                pt += p[k] * t[k]
-                qs += q[k] * s[k]
-                qt += q[k] * t[k]
-                rs += r[k] * s[k]
-                rt += r[k] * t[k]
-            result[a, b], result[a, b1], result[a1, b], result[a1, b1] = ps, pt, qs, qt
-            result[a2, b], result[a2, b1] = rs, rt
+            (result[a, b], result[a, b1], result[a1, b], result[a1, b1], result[a2, b], result[a2, b1]) = row_products(
+                rows[a], rows[a1], rows[a2], rows[b], rows[b1]
+            )
     for a in range(n):
         for b in range(a):
             result[b, a] = result[a, b]
