@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.evaluation.likeness import root_mean_square
 from morph_dslam.identification.measured_forces import MeasuredForces
-from morph_dslam.identification.measurements import Measurement, Unknowns
-from morph_dslam.identification.values import FACTOR
+from morph_dslam.identification.measurements import Measurement
+from morph_dslam.identification.values import FACTOR, Values
 from morph_dslam.model import Parameter
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Misfit:
     model_rms: float
     run_rms: float
     by_range: Array
-    at: Unknowns
+    at: Values
 
     @property
     def missed(self) -> Array:

@@ -13,7 +13,7 @@ from morph_dslam.evaluation.force import ReactionInDirection
 from morph_dslam.evaluation.force_curves import ForceCurve
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.identification.common_errors import state_errors
-from morph_dslam.identification.measurements import Unknowns
+from morph_dslam.identification.values import Values
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.separated import Outside
 from morph_dslam.model.stated_errors import force_error
@@ -176,10 +176,10 @@ class MeasuredForces:
         stated = force_error(self.model, self.reaction.support)
         return stated is not None and stated[1]
 
-    def predict(self, unknowns: Unknowns) -> Array:
+    def predict(self, unknowns: Values) -> Array:
         return self.compared.sign * self._forces(unknowns)[:, self.compared.axis]
 
-    def _forces(self, unknowns: Unknowns) -> Array:
+    def _forces(self, unknowns: Values) -> Array:
         """On the support (n, 3), N."""
         # A search by the factor may leave the range of loads, where the same state for all would end it.
         outside: Outside = "bounded" if self.are_shown else "linear"
@@ -192,7 +192,7 @@ class MeasuredForces:
     def loose(self, predicted: Array) -> Array:
         return np.ones((len(predicted), int(self.free_zero)))
 
-    def model_errors(self, unknowns: Unknowns) -> Array:
+    def model_errors(self, unknowns: Values) -> Array:
         stated = force_error(self.model, self.reaction.support)
         if stated is None:
             return np.zeros((0, len(self.values)))
@@ -201,7 +201,7 @@ class MeasuredForces:
         sizes = np.linalg.norm(forces, axis=1) * np.sign(self.compared.sign * forces[:, self.compared.axis])
         return stated[0] * sizes[None]
 
-    def state_errors(self, unknowns: Unknowns) -> Array:
+    def state_errors(self, unknowns: Values) -> Array:
         run = self.run
         if run is None or not self.are_shown:
             return np.zeros((0, len(self.values)))

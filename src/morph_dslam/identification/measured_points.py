@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.geometry import SimilarityTransform, fit_similarity
-from morph_dslam.identification.measurements import Unknowns
 from morph_dslam.identification.model_error import shape_errors
+from morph_dslam.identification.values import Values
 from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
@@ -118,7 +118,7 @@ class MeasuredPoints:
     def mesh_error_stated(self) -> bool:
         return ParameterErrors.of(self.model) is not None
 
-    def predict(self, unknowns: Unknowns) -> Array:
+    def predict(self, unknowns: Values) -> Array:
         return self.positions(unknowns.vector)[self._present]
 
     def adjusted(self, predicted: Array) -> Array:
@@ -140,10 +140,10 @@ class MeasuredPoints:
         turns = np.asarray(np.cross(np.eye(3)[:, None], arms), dtype=np.float64).reshape(3, -1)
         return np.vstack([np.tile(np.eye(3), (1, len(points))), turns]).T
 
-    def model_errors(self, unknowns: Unknowns) -> Array:
+    def model_errors(self, unknowns: Values) -> Array:
         return shape_errors(self.model, self.positions, unknowns.vector, unknowns.free(self.given))[:, self._present]
 
-    def state_errors(self, unknowns: Unknowns) -> Array:
+    def state_errors(self, unknowns: Values) -> Array:
         """None: states are as the table gives them."""
         return np.zeros((0, len(self.values)))
 
@@ -156,7 +156,7 @@ class MeasuredPoints:
         ]
         return np.array([self._of_values(share) for share in shares], dtype=np.float64)
 
-    def slopes_by_given(self, unknowns: Unknowns) -> Array:
+    def slopes_by_given(self, unknowns: Values) -> Array:
         """Derivatives (n, p) of adjusted predictions by the known parameters, each over its range."""
         motion = self._motion(self.predict(unknowns)).rotation if self.aligned else np.eye(3)
         columns = []

@@ -7,35 +7,16 @@ or along a stretch of a force curve, are not independent of each other.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.identification.values import Values
 from morph_dslam.model import ReducedModel
 
 Array = NDArray[np.float64]
-
-
-class Unknowns(Protocol):
-    """Values of what is identified."""
-
-    factor: float
-    """Common factor of all moduli."""
-
-    def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
-        """The model's parameters (d,), SI, where these are known; what is ``shown`` is so but for what is identified.
-
-        Loads that are ``known`` are divided by the factor of the moduli (`given_loads`), but for those that were
-        ``shown`` by pictures: with them the model, whose moduli they do not have, has the shape that was seen.
-        """
-        ...
-
-    def free(self, given: Collection[str]) -> frozenset[str]:
-        """Names of the model's parameters that they change where these are given."""
-        ...
 
 
 class Measurement(Protocol):
@@ -82,7 +63,7 @@ class Measurement(Protocol):
         """Whether the model states what its mesh adds to the errors of predictions."""
         ...
 
-    def predict(self, unknowns: Unknowns) -> Array:
+    def predict(self, unknowns: Values) -> Array:
         """(n,), SI."""
         ...
 
@@ -96,7 +77,7 @@ class Measurement(Protocol):
         """
         ...
 
-    def model_errors(self, unknowns: Unknowns) -> Array:
+    def model_errors(self, unknowns: Values) -> Array:
         """Errors (e, n) of predictions by the model itself, SI, independent of each other, of either sign.
 
         Measurements of one unit share them.
@@ -108,7 +89,7 @@ class Measurement(Protocol):
         """The run that found the states in which it was measured, if one did."""
         ...
 
-    def state_errors(self, unknowns: Unknowns) -> Array:
+    def state_errors(self, unknowns: Values) -> Array:
         """Errors (e, n) of predictions by those of the states that a run found, SI, independent of each other.
 
         Measurements of one run share them.

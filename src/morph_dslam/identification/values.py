@@ -25,6 +25,7 @@ class Values:
 
     Attributes
     ----------
+    factor : the common one of all moduli.
     beyond : values, SI, of parameters that such a division has taken out of their ranges, by name.
     """
 
@@ -38,6 +39,11 @@ class Values:
         self.beyond: dict[str, list[float]] = {}
 
     def vector(self, known: Mapping[str, float], shown: bool = False) -> Array:
+        """The model's parameters (d,), SI, where these are known; what is ``shown`` is so but for what is identified.
+
+        Loads that are ``known`` are divided by the factor of the moduli (`given_loads`), but for those that were
+        ``shown`` by pictures: with them the model, whose moduli they do not have, has the shape that was seen.
+        """
         # A table is right about what it gives; a run saw shapes, of which what is identified is a part.
         mu = self._model.vector({**known, **self._own} if shown else {**self._own, **known})
         for k, parameter in enumerate(self._model.parameters):
@@ -49,6 +55,7 @@ class Values:
         return mu
 
     def free(self, given: Collection[str]) -> frozenset[str]:
+        """Names of the model's parameters that they change where these are given."""
         return frozenset(self._own).difference(given) | self._divided
 
     def shown(self, names: Sequence[str]) -> Array:
