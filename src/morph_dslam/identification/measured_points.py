@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import IdentificationError
 from morph_dslam.geometry import SimilarityTransform, fit_similarity
-from morph_dslam.identification.model_error import shape_errors
+from morph_dslam.identification.common_errors import shape_errors
 from morph_dslam.identification.values import Values
 from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
