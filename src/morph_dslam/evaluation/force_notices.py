@@ -9,10 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.evaluation.force_curves import FORCE_UNITS, ForceCurve, newtons_of
-from morph_dslam.evaluation.frame_numbers import HOW_FRAMES_COUNT, force_shift, in_words
+from morph_dslam.evaluation.frame_numbers import (
+    CLEARLY,
+    FEWEST_FORCES,
+    HOW_FRAMES_COUNT,
+    Correction,
+    fit_columns,
+    force_shift,
+    in_words,
+)
 from morph_dslam.evaluation.likeness import Likeness, likeness, root_mean_square
-from morph_dslam.evaluation.place_units import place_scale
 from morph_dslam.notices import Notice
+from morph_dslam.units import smaller_units
 
 Array = NDArray[np.float64]
 #: Forces that change by more than so many times as much as the model's, or less than its inverse, are others. In the
@@ -139,8 +147,8 @@ class OtherPlaceUnit(ForceNotice):
 
     @classmethod
     def of(cls, quantity: str, curve: ForceCurve, places: Array, modelled: Array) -> OtherPlaceUnit | None:
-        """The notice that a curve needs, if it does; see `place_scale`."""
-        found = place_scale(quantity, curve, places, modelled, ALIKE)
+        """The notice that a curve needs, if it does; see `_place_scale`."""
+        found = _place_scale(quantity, curve, places, modelled)
         if found is None:
             return None
         return cls(curve.name, curve.against, found.by, found.factor, found.rms, found.rms_as_given)
@@ -163,6 +171,34 @@ class NeighboursAlike(ForceNotice):
     )
     durbin_watson: float
     picture: str
+
+
+def _place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array) -> Correction | None:
+    """Whether a smaller unit of a curve's places explains a factor of its forces, and what that leaves.
+
+    A factor up to `ALIKE`, or its inverse, needs no explanation. With a smaller unit more of the curve is compared,
+    which no noise and no other law makes straighter. A larger one is not tried: any short piece of a curve is straight.
+    Most frames are then off the curve as it is given.
+
+    Parameters
+    ----------
+    quantity : of the parameter that the curve is given by.
+    places : (e,) the parameter in frames of the run.
+    modelled : (e,) the model's force there.
+    """
+    order = np.argsort(curve.places, kind="stable")
+    known, forces = curve.places[order], curve.forces[order]
+    found = []
+    for scale in smaller_units(quantity):
+        inside = (places >= scale * known[0]) & (places <= scale * known[-1])
+        if inside.sum() < FEWEST_FORCES:
+            continue
+        (given, _), before = fit_columns(np.interp(places[inside], known, forces), modelled[inside])
+        (factor, _), rms = fit_columns(np.interp(places[inside], scale * known, forces), modelled[inside])
+        is_size = 1.0 / ALIKE <= factor <= ALIKE and not 1.0 / ALIKE <= given <= ALIKE
+        if is_size and before > CLEARLY * rms:
+            found.append(Correction(scale, float(factor), rms, before))
+    return min(found, key=lambda each: each.rms, default=None)
 
 
 def force_notices(
