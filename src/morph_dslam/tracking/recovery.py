@@ -21,8 +21,8 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import Rejection, RejectionReason
 from morph_dslam.tracking.patches import zero_where_unknown
 from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.relocalization import matching_shifts
 from morph_dslam.tracking.state import Prior, State
-from morph_dslam.tracking.template_matching import matching_shifts
 
 Array = NDArray[np.float64]
 #: An object that is found anew is believed if half of its points agree, or if they agree as closely as this,
