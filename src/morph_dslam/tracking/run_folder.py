@@ -30,14 +30,13 @@ from morph_dslam.model.discrepancy import Discrepancy, save_discrepancies
 from morph_dslam.model.inner_structure import CarriedStructure
 from morph_dslam.model.stated_errors import force_error, uncounted
 from morph_dslam.notices import Notice
-from morph_dslam.tracking.contradictions import contradictions
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
 from morph_dslam.tracking.repeated_pictures import RepeatedPictures
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.run_notices import flags_of, notices_of
-from morph_dslam.tracking.run_results import RunResults
+from morph_dslam.tracking.run_results import RunResults, contradictions
 from morph_dslam.tracking.sinks import TrackedFrame
 
 Array = NDArray[np.float64]

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from morph_dslam.model.stated_errors import doubtful_errors, errors_in_words, unknown_mesh_error
 from morph_dslam.model.unknown_loads import supports_beside_loads
 from morph_dslam.notices import Notice
-from morph_dslam.tracking.contradictions import contradictions
 from morph_dslam.tracking.displacement_jumps import largest_jump
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE, statement, unobservable_in_run, with_deviation
 from morph_dslam.tracking.outcomes import (
@@ -35,7 +34,7 @@ from morph_dslam.tracking.outcomes import (
     TrackingWarning,
 )
 from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE, FLOOR_PX, UNEXPLAINED_PX
-from morph_dslam.tracking.run_results import RunResults
+from morph_dslam.tracking.run_results import RunResults, contradictions
 
 _Warning = TypeVar("_Warning", bound=TrackingWarning)
 

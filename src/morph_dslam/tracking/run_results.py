@@ -1,4 +1,4 @@
-"""The results of all frames of one object, in memory."""
+"""The results of all frames of one object, in memory, and frames that contradict each other in them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.observability import beyond_first_order, largest_displacement, largest_von_mises
-from morph_dslam.tracking.outcomes import Status
+from morph_dslam.tracking.outcomes import PastForgotten, Status
 from morph_dslam.tracking.point_rotations import Surroundings
 from morph_dslam.tracking.reactions import Reaction, Reactions, VectorEstimate
 from morph_dslam.tracking.result import STAGES, FrameResult
+from morph_dslam.tracking.sequence_filter import PATIENCE
 
 Array = NDArray[np.float64]
+#: So many standard deviations of both together, with all that these contain, are a contradiction. The filter begins
+#: anew by what is new in each frame alone; errors of the model that change with the state may be the whole difference.
+APART = 3.0
 
 
 @dataclass
@@ -275,3 +279,46 @@ class RunResults:
     def counts(self) -> NDArray[np.int64]:
         """(f, 2): points that could be seen, and those that support the estimate."""
         return np.array([(r.n_points, r.n_inliers) for r in self.results], dtype=np.int64).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Two values of one parameter.
+
+    Attributes
+    ----------
+    parameter : its number in the model.
+    before, after : value and standard deviation, SI, in the frame ``last`` and in the frame ``first``.
+    last : number of the last frame that agreed with those before.
+    first : number of the one from which on the others count.
+    """
+
+    parameter: int
+    before: tuple[float, float]
+    after: tuple[float, float]
+    last: int
+    first: int
+
+    @property
+    def deviations(self) -> float:
+        """How many standard deviations of both together lie between the values."""
+        return abs(self.after[0] - self.before[0]) / max(float(np.hypot(self.before[1], self.after[1])), 1e-300)
+
+
+def contradictions(run: RunResults) -> list[Contradiction]:
+    """Of each per-sequence parameter in which frames contradict each other, where they do so most."""
+    tracked = np.flatnonzero(run.tracked)
+    values, deviations = run.parameters(), run.parameter_std()
+    found: dict[int, Contradiction] = {}
+    for place, row in enumerate(tracked):
+        if place < PATIENCE or not any(isinstance(one, PastForgotten) for one in run.results[row].warnings):
+            continue
+        agreed = tracked[place - PATIENCE]
+        for k, parameter in enumerate(run.model.study_parameters):
+            pairs = [(float(values[i, k]), float(deviations[i, k])) for i in (agreed, row)]
+            one = Contradiction(k, pairs[0], pairs[1], run.frames[agreed], run.frames[row])
+            if parameter.name in run.per_sequence and one.deviations > max(
+                APART, found[k].deviations if k in found else 0.0
+            ):
+                found[k] = one
+    return [found[k] for k in sorted(found)]
