@@ -11,8 +11,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter
 from morph_dslam.tracking.combinations import check_options, check_times
 from morph_dslam.tracking.estimator import Estimator, State
-from morph_dslam.tracking.known_time import KnownTime
-from morph_dslam.tracking.known_values import KnownValues
+from morph_dslam.tracking.known_values import KnownTime, KnownValues
 from morph_dslam.tracking.outcomes import TimeOutside
 from morph_dslam.tracking.run_options import TrackOptions
 from tests.support.bent_sheet import bent_sheet_model

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import ArgumentError, TrackingError, check_kind
 from morph_dslam.io.text import has_a_cell_for_each, read_csv
-from morph_dslam.model import ReducedModel
+from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.registration.registration import Registration
-from morph_dslam.tracking.known_time import KnownTime
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.outcomes import TimeOutside
 from morph_dslam.tracking.state import moved
@@ -31,6 +30,8 @@ FRAME, STD = "frame", "_std_"
 FARTHEST = 3.0
 #: Without a deviation, a value is known to this part of its range.
 USUAL_STD = 0.005
+#: A time is known to half of the interval since the frame before, and to this part of its range at most.
+USUAL_TIME_STD = 1e-3
 #: The least spread of residuals, pixels, that is believed when they are weighed against what is known, or depths.
 LEAST_SIGMA_PX = 0.1
 #: Values may lie outside of the range by this part of it: a sensor has noise, also where nothing acts.
@@ -169,6 +170,57 @@ def with_usual_deviations(model: ReducedModel, indices: NDArray[np.int64], value
     usual = USUAL_STD * (model.upper - model.lower)[indices]
     found[:, 1] = np.where(np.isnan(values[:, 1]), usual, values[:, 1])
     return found
+
+
+@dataclass
+class KnownTime:
+    """The one parameter of a model that measures time.
+
+    Attributes
+    ----------
+    index : of the parameter.
+    parameter : itself.
+    zero : time of the recording at which it is zero, seconds.
+    before : time of the frame before, seconds; None in the first.
+    """
+
+    index: int
+    parameter: Parameter
+    zero: float
+    before: float | None = None
+
+    @classmethod
+    def of(cls, model: ReducedModel, zero: float) -> KnownTime:
+        """That of a model.
+
+        Raises
+        ------
+        TrackingError
+            If none of its parameters measures time, or several and its study does not say which one is the time.
+        """
+        clocks = [(k, model.parameters[k]) for k in model.clocks]
+        if len(clocks) != 1:
+            named = ", ".join(p.name for _, p in clocks)
+            raise TrackingError(
+                f"--time-zero (time_zero): the model '{model.name}' has "
+                + (
+                    f"several parameters that measure time ({named}): give theirs by --known"
+                    if clocks
+                    else "no parameter that measures time: leave it out"
+                )
+            )
+        return cls(*clocks[0], zero)
+
+    def at(self, timestamp: float) -> tuple[float, float] | TimeOutside:
+        """Time and its standard deviation in a frame of this time, seconds; or that it is outside of its range."""
+        parameter, time = self.parameter, timestamp - self.zero
+        most = USUAL_TIME_STD * (parameter.upper - parameter.lower)
+        interval = 2.0 * most if self.before is None else timestamp - self.before
+        self.before = timestamp
+        if not parameter.lower <= time <= parameter.upper:
+            is_before = time < parameter.lower
+            return TimeOutside(parameter.name, parameter.text(time), parameter.range_text, is_before)
+        return time, min(0.5 * interval, most) if interval > 0.0 else most
 
 
 def registered_with(registration: Registration, known: KnownValues, frame: int) -> Registration:

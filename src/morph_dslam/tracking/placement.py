@@ -22,8 +22,7 @@ from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.hypothesis import Image
-from morph_dslam.tracking.known_time import KnownTime
-from morph_dslam.tracking.known_values import registered_with
+from morph_dslam.tracking.known_values import KnownTime, registered_with
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import drawn_depth
 from morph_dslam.tracking.options import TrackerOptions

@@ -23,8 +23,7 @@ from morph_dslam.registration.registration import Registration, in_scene, load_r
 from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
-from morph_dslam.tracking.known_time import KnownTime
-from morph_dslam.tracking.known_values import KnownValues
+from morph_dslam.tracking.known_values import KnownTime, KnownValues
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera
