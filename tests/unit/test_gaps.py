@@ -5,7 +5,7 @@ import pytest
 
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
-from morph_dslam.tracking.gaps import FrameGaps
+from morph_dslam.tracking.frame_starts import FrameGaps
 from morph_dslam.tracking.outcomes import Status
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model

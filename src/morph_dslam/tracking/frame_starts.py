@@ -1,7 +1,11 @@
-"""Where a frame's estimate starts, and what frames have to do with each other: parameters that are kept or walk."""
+"""Where a frame's estimate starts, and what frames have to do with each other: parameters that are kept or walk, gaps.
+
+After a long gap the object may be anywhere, and is looked for as after a loss.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -21,6 +25,10 @@ from morph_dslam.tracking.state import moved, pose_increment
 
 #: A start off a bound is this share of the range inside of it.
 OFF_BOUND = 0.02
+#: A gap is longer than this, seconds, and than so many usual intervals: a recording may have one frame a minute.
+GAP_S, GAP_INTERVALS = 0.5, 5.0
+#: The usual interval is the median of so many.
+INTERVALS = 31
 Frame = TypeVar("Frame", Observations, RigObservations)
 
 
@@ -125,6 +133,29 @@ def at_constant_velocity(before: State, last: State) -> State:
     """
     turned = pose_increment(before.camera_from_object, last.camera_from_object)
     return moved(last, np.concatenate([last.parameters - before.parameters, turned]))
+
+
+class FrameGaps:
+    """Watches the times of frames."""
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+
+    def after_gap(self, timestamp: float) -> bool:
+        """Whether a frame comes a long time after the one before; times that stand still or run back make no gap.
+
+        Parameters
+        ----------
+        timestamp : of the next frame, seconds.
+        """
+        last, self._last = self._last, timestamp
+        if last is None:
+            return False
+        interval = timestamp - last
+        is_gap = bool(self._intervals) and interval > max(GAP_S, GAP_INTERVALS * float(np.median(self._intervals)))
+        self._intervals.append(interval)
+        return is_gap
 
 
 def temporal_facts(parameters: Sequence[Parameter], options: TrackerOptions) -> dict[str, str]:

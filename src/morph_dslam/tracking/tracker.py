@@ -36,12 +36,12 @@ from morph_dslam.tracking.frame_results import (
     with_model_errors,
 )
 from morph_dslam.tracking.frame_starts import (
+    FrameGaps,
     a_turn_back,
     at_constant_velocity,
     new_filter,
     with_unobservable_at_default,
 )
-from morph_dslam.tracking.gaps import FrameGaps
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.noise import middle
