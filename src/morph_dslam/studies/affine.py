@@ -7,8 +7,9 @@ parameter without unit) are sums of both. A parameter over a quantity of its own
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.model import Parameter
+from morph_dslam.model.reduced_model import state_text
 from morph_dslam.units import FACTORS, quantity_of, to_si
 
 Array = NDArray[np.float64]
@@ -164,6 +166,59 @@ def read_affine(
         else:
             slopes[index] += sign * number
     return Affine(constant, tuple(slopes.tolist()), tuple(products))
+
+
+#: Parameters whose ends are all combined at most.
+_MOST_COMBINED = 8
+
+
+@dataclass(frozen=True)
+class Variables:
+    """What the expressions of a study may name.
+
+    Attributes
+    ----------
+    parameters : d of them, in the order of the file.
+    amplitudes : of the study's time.
+    """
+
+    parameters: Sequence[Parameter]
+    amplitudes: Amplitudes = NO_AMPLITUDES
+
+    @property
+    def defaults(self) -> Array:
+        """Values (d,) of the parameters, SI."""
+        return np.array([p.default for p in self.parameters])
+
+    def read(self, value: Any, quantity: str | None) -> Affine:
+        """See `read_affine`."""
+        return read_affine(value, quantity, self.parameters, self.amplitudes)
+
+    def reader(self, mu: Array | None = None) -> Callable[[Any, str | None], float]:
+        """Reads values as numbers at ``mu`` (d,), at the defaults if None."""
+        at = self.defaults if mu is None else mu
+        return lambda value, quantity: self.read(value, quantity)(at)
+
+    def range_ends(
+        self, used: Sequence[int] | None = None, combined: bool = False
+    ) -> Iterator[tuple[list[int], Array]]:
+        """Both ends of the range of each parameter ``used`` (None: of all), the others at their defaults.
+
+        With each state (d,) the numbers of the parameters at an end; after single ones all ends ``combined``.
+        """
+        used = list(range(len(self.parameters)) if used is None else used)
+        groups = [[k] for k in used]
+        if combined and 1 < len(used) <= _MOST_COMBINED:
+            groups.append(used)
+        for group in groups:
+            for values in itertools.product(*((self.parameters[k].lower, self.parameters[k].upper) for k in group)):
+                mu = self.defaults
+                mu[group] = values
+                yield group, mu
+
+    def text(self, mu: Array, among: Sequence[int]) -> str:
+        """A state (d,), of the parameters of these numbers alone, for messages."""
+        return state_text([self.parameters[k] for k in among], mu[list(among)])
 
 
 def _amplitude(term: re.Match, text: str, known: Amplitudes) -> tuple[Mapping[str, Any], str]:

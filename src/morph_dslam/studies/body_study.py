@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,8 +17,7 @@ from morph_dslam.mechanics.shell_material import ShellMaterial
 from morph_dslam.mechanics.supports import Constraints, ElasticFoundation
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
-from morph_dslam.model.reduced_model import state_text
-from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
+from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, Variables
 from morph_dslam.studies.parameters import ParameterSection
 from morph_dslam.studies.problem import Snapshot
 from morph_dslam.studies.sections import JOINED
@@ -73,13 +71,9 @@ def with_named_sets(mesh: Mesh, sets: Iterable[NamedSet]) -> Mesh:
 
 #: What cannot be at every value of its constants: a thickness is a float.
 _CHECKED = (Material, ShellMaterial, RigidSphere, RigidCylinder, ElasticFoundation, float)
-#: Parameters of one quantity whose ends are all combined.
-_MOST_COMBINED = 8
 
 
-def read_once(
-    parts: Sequence[tuple[str, Any]], parameters: Sequence[Parameter], amplitudes: Amplitudes = NO_AMPLITUDES
-) -> None:
+def read_once(parts: Sequence[tuple[str, Any]], variables: Variables) -> None:
     """Read every value of sections with ``make``, so that a mistake is found before anything is solved.
 
     Materials, thicknesses, radii of obstacles and foundations are checked at the defaults of the parameters and at both
@@ -87,31 +81,28 @@ def read_once(
     the relative moduli of a Prony series must not sum to 1. Raises ValueError saying in which of the ``parts``, named
     sections, the mistake is, and at which value of a parameter if that is its cause.
     """
-    defaults = np.array([p.default for p in parameters])
     for where, section in parts:
         used: set[int] = set()
         try:
-            made = _made(section, parameters, defaults, used, amplitudes)
+            made = _made(section, variables, variables.defaults, used)
         except StudyError as error:
-            blamed = _to_blame(section, parameters, used, amplitudes)
-            raise ValueError(f"{where}: {error}{_changed_range(parameters, blamed, defaults)}") from error
+            blamed = [k for k in sorted(used) if _is_to_blame(section, variables, k)]
+            raise ValueError(f"{where}: {error}{_changed_range(variables, blamed, variables.defaults)}") from error
         if not isinstance(made, _CHECKED):
             continue
         elastic = isinstance(made, ShellMaterial) or (isinstance(made, Material) and made.prony is None)
-        for at, mu in range_ends(parameters, sorted(used), combined=not elastic):
+        for at, mu in variables.range_ends(sorted(used), combined=not elastic):
             try:
-                _made(section, parameters, mu, set(), amplitudes)
+                _made(section, variables, mu, set())
             except StudyError as error:
-                raise ValueError(f"{where}: {error}{_changed_range(parameters, at, mu)}") from error
+                raise ValueError(f"{where}: {error}{_changed_range(variables, at, mu)}") from error
 
 
-def _made(
-    section: Any, parameters: Sequence[Parameter], mu: Array, used: set[int], amplitudes: Amplitudes = NO_AMPLITUDES
-) -> Any:
+def _made(section: Any, variables: Variables, mu: Array, used: set[int]) -> Any:
     """What a section describes at ``mu`` (d,), checked; ``used`` takes the parameters that it depends on."""
 
     def read(value: Value, quantity: str | None) -> float:
-        found = read_affine(value, quantity, parameters, amplitudes)
+        found = variables.read(value, quantity)
         used.update(found.used)
         return found(mu)
 
@@ -121,65 +112,39 @@ def _made(
     return made
 
 
-def range_ends(parameters: Sequence[Parameter], used: list[int], combined: bool) -> Iterator[tuple[list[int], Array]]:
-    """Both ends of the range of each parameter ``used``, the others at their defaults, then all ends ``combined``."""
-    groups = [[k] for k in used]
-    if combined and 1 < len(used) <= _MOST_COMBINED:
-        groups.append(used)
-    for group in groups:
-        for values in product(*((parameters[k].lower, parameters[k].upper) for k in group)):
-            mu = np.array([p.default for p in parameters])
-            mu[group] = values
-            yield group, mu
+def _is_to_blame(section: Any, variables: Variables, k: int) -> bool:
+    """Whether another value of a parameter makes a section possible that cannot be at the defaults.
+
+    Such a value is an end of the range, its middle, or a mirrored end, for ranges of a wrong sign.
+    """
+    lower, upper, mu = variables.parameters[k].lower, variables.parameters[k].upper, variables.defaults
+    for value in (upper, lower, (lower + upper) / 2.0, -lower, -upper):
+        mu[k] = value
+        try:
+            _made(section, variables, mu, set())
+        except StudyError:
+            continue
+        return True
+    return False
 
 
-def _to_blame(section: Any, parameters: Sequence[Parameter], used: set[int], amplitudes: Amplitudes) -> list[int]:
-    """Those parameters ``used`` whose default alone makes a section impossible: with another value it can be."""
-
-    def can_be(k: int) -> bool:
-        return any(_can_be(section, parameters, k, value, amplitudes) for value in _others(parameters[k]))
-
-    return [k for k in sorted(used) if can_be(k)]
-
-
-def _others(parameter: Parameter) -> tuple[float, ...]:
-    """Values that a parameter might have in place of its default; mirrored ones for ranges of a wrong sign."""
-    lower, upper = parameter.lower, parameter.upper
-    return upper, lower, (lower + upper) / 2.0, -lower, -upper
-
-
-def _can_be(section: Any, parameters: Sequence[Parameter], k: int, value: float, amplitudes: Amplitudes) -> bool:
-    mu = np.array([p.default for p in parameters])
-    mu[k] = value
-    try:
-        _made(section, parameters, mu, set(), amplitudes)
-    except StudyError:
-        return False
-    return True
-
-
-def _changed_range(parameters: Sequence[Parameter], at: list[int], mu: Array) -> str:
+def _changed_range(variables: Variables, at: list[int], mu: Array) -> str:
     """What ends the message about a section that cannot be at ``mu`` (d,), because of the parameters ``at``."""
     if not at:
         return ""
-    state = state_text([parameters[k] for k in at], mu[at])
-    return f" where {state}: change {'its range' if len(at) == 1 else 'their ranges'}"
-
-
-def amplitudes_of(symbols: ParameterSymbols) -> Amplitudes:
-    """Those of a study's symbols."""
-    names = [parameter.name for parameter in symbols.parameters]
-    return Amplitudes(names.index(symbols.clock), symbols.amplitudes) if symbols.amplitudes else NO_AMPLITUDES
+    return f" where {variables.text(mu, at)}: change {'its range' if len(at) == 1 else 'their ranges'}"
 
 
 def reader_of(symbols: ParameterSymbols) -> Reader:
     """Reads a value of a study as an expression of the symbols."""
-    values = [symbols[parameter.name] for parameter in symbols.parameters]
-    known = amplitudes_of(symbols)
+    names = [parameter.name for parameter in symbols.parameters]
+    clock = names.index(symbols.clock) if symbols.amplitudes else -1
+    variables = Variables(symbols.parameters, Amplitudes(clock, symbols.amplitudes))
+    values = [symbols[name] for name in names]
     functions = {name: symbols[name] for name in symbols.amplitudes}
 
     def read(value: Value, quantity: str | None) -> Any:
-        return read_affine(value, quantity, symbols.parameters, known).expression(values, functions)
+        return variables.read(value, quantity).expression(values, functions)
 
     return read
 
@@ -236,15 +201,17 @@ class BodyStudy:
         """The functions of time that terms may be multiplied by; none."""
         return NO_AMPLITUDES
 
+    def variables(self) -> Variables:
+        """What the expressions of the study may name."""
+        return Variables(self.model_parameters(), self.amplitudes())
+
     def check_parameters_used(self, elsewhere: Sequence[str] = ()) -> None:
         """Raise StudyError if a parameter changes nothing; those named ``elsewhere`` do."""
-        parameters = self.model_parameters()
-        defaults, used = self.root(), set(elsewhere)
+        variables, numbers = self.variables(), set[int]()
         for _, section in self._parts():
-            numbers: set[int] = set()
-            _made(section, parameters, defaults, numbers, self.amplitudes())
-            used |= {parameters[k].name for k in numbers}
-        if unused := [parameter.name for parameter in parameters if parameter.name not in used]:
+            _made(section, variables, variables.defaults, numbers)
+        used = {*elsewhere, *(variables.parameters[k].name for k in numbers)}
+        if unused := [parameter.name for parameter in variables.parameters if parameter.name not in used]:
             raise StudyError(
                 f"the parameter {unused[0]} is used nowhere in the study: name it in a load, a support or a material, "
                 "or leave it out"

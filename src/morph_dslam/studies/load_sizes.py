@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,16 @@ from morph_dslam.mechanics.materials.base import Material, isotropic_average
 from morph_dslam.mechanics.shell_problem import ShellProblem
 from morph_dslam.meshing.mesh_summary import faces_figures
 from morph_dslam.meshing.meshes import Mesh
-from morph_dslam.model import Parameter
-from morph_dslam.model.reduced_model import state_text
-from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
-from morph_dslam.studies.body_study import numbered, range_ends
-from morph_dslam.studies.solid_sections import CouplingSection, ForceLoad, MovingLineLoad, MovingPatchLoad, Value
+from morph_dslam.studies.affine import Variables
+from morph_dslam.studies.body_study import numbered
+from morph_dslam.studies.solid_sections import (
+    CouplingSection,
+    ForceLoad,
+    MovingLineLoad,
+    MovingPatchLoad,
+    Value,
+    triple,
+)
 
 #: Loads of more than so many shear moduli carry no rubber's shape any more: their unit is probably wrong.
 MOST_MODULI = 20.0
@@ -33,8 +38,7 @@ def load_doubt(
     couplings: Iterable[CouplingSection],
     materials: Iterable[Any],
     mesh: Mesh,
-    parameters: Sequence[Parameter],
-    amplitudes: Amplitudes = NO_AMPLITUDES,
+    variables: Variables,
 ) -> str:
     """A sentence on the first load that is far too large for the stiffest material, or acts far away; else "".
 
@@ -42,29 +46,25 @@ def load_doubt(
     ----------
     loads, couplings, materials : sections of a study.
     mesh : with the sets that loads and couplings name.
-    parameters : that they may name; materials count at the defaults, loads where the ranges make them largest.
-    amplitudes : that they may name.
+    variables : that they may name; materials count at the defaults, loads where the ranges make them largest.
     """
-    shear = max(_shear_modulus(section, parameters, amplitudes) for section in materials)
+    shear = max(_shear_modulus(section, variables) for section in materials)
     coupled = numbered("coupling", couplings)
     for where, section in (*numbered("load", loads), *coupled):
-        largest = _largest_stress(section, mesh, parameters, amplitudes)
+        largest = _largest_stress(section, mesh, variables)
         if largest > MOST_MODULI * shear:
             return (
                 f"{where.capitalize()} reaches {_shown(largest)}, {largest / shear:.0f} times the shear modulus of the "
                 f"stiffest material ({_shown(shear)}): are its unit and that of the modulus right? "
             )
-    return "".join(_point_doubt(where, section, mesh, parameters, amplitudes) for where, section in coupled)
+    return "".join(_point_doubt(where, section, mesh, variables) for where, section in coupled)
 
 
-def _point_doubt(
-    where: str, section: CouplingSection, mesh: Mesh, parameters: Sequence[Parameter], amplitudes: Amplitudes
-) -> str:
+def _point_doubt(where: str, section: CouplingSection, mesh: Mesh, variables: Variables) -> str:
     """A sentence if a coupling's point is, at the defaults, many lengths of the mesh away from its set; else ""."""
     if section.point is None:
         return ""
-    defaults = np.array([parameter.default for parameter in parameters])
-    point = np.array([read_affine(value, "length", parameters, amplitudes)(defaults) for value in section.point])
+    point = np.array(triple(section.point, "length", variables.reader()))
     distance = float(np.linalg.norm(mesh.nodes[mesh.set_nodes(section.on)] - point, axis=1).min())
     length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
     if distance <= MOST_LENGTHS * length:
@@ -82,47 +82,42 @@ def shell_load_doubt(problem: ShellProblem) -> str:
     """
     if any(isinstance(load, Gravity) for load in problem.loads):
         return ""
-    parameters, undeformed, defaults = problem.symbols.parameters, np.zeros(problem.n_dofs), problem.symbols.default
+    variables, undeformed = Variables(problem.symbols.parameters), np.zeros(problem.n_dofs)
     try:
-        tangent = problem.linearise(undeformed, defaults)
+        tangent = problem.linearise(undeformed, variables.defaults)
     except SolverError:
         return ""
-    for at, mu in range_ends(parameters, list(range(len(parameters))), combined=False):
+    for at, mu in variables.range_ends():
         moved = problem.nodal_displacement(tangent.solve(problem.residual(undeformed, mu)))
         sizes = float(np.linalg.norm(moved, axis=1).max()) / problem.length
         if sizes > MOST_SIZES:
             return (
-                f"The loads at {state_text([parameters[k] for k in at], mu[at])} would move the shell by {sizes:.0f} "
+                f"The loads at {variables.text(mu, at)} would move the shell by {sizes:.0f} "
                 "times its size if it stayed as stiff as it is undeformed: are their units, and those of modulus and "
                 "thickness, right? "
             )
     return ""
 
 
-def _shear_modulus(section: Any, parameters: Sequence[Parameter], amplitudes: Amplitudes) -> float:
+def _shear_modulus(section: Any, variables: Variables) -> float:
     """Of a material at small strain, Pa."""
-    defaults = np.array([parameter.default for parameter in parameters])
-
-    def read(value: Value, quantity: str | None) -> float:
-        return read_affine(value, quantity, parameters, amplitudes)(defaults)
-
-    made = section.make(read)
+    made = section.make(variables.reader())
     assert isinstance(made, Material)
     return isotropic_average(made.small_strain_stiffness())[1]
 
 
-def _largest_stress(section: Any, mesh: Mesh, parameters: Sequence[Parameter], amplitudes: Amplitudes) -> float:
+def _largest_stress(section: Any, mesh: Mesh, variables: Variables) -> float:
     """The largest pressure, or component of a traction, anywhere in the ranges of the parameters, Pa.
 
     Forces over a surface count with their mean, those of moving loads with that at their centre on a plane, moments
     with the stress at the edges of a square that they bend.
     """
     over = {"pressure": 1.0, "stress": 1.0} | _areas(section, mesh)
-    ends = np.array([[parameter.lower, parameter.upper] for parameter in parameters])
+    ends = np.array([[parameter.lower, parameter.upper] for parameter in variables.parameters])
     largest = [0.0]
 
     def read(value: Value, quantity: str | None) -> float:
-        found = read_affine(value, quantity, parameters, amplitudes)
+        found = variables.read(value, quantity)
         if quantity in over:
             largest.append(float(np.abs(found.extremes(ends)).max()) / over[quantity])
         return found.constant

@@ -17,10 +17,8 @@ from morph_dslam.mechanics.landed_force import (
     smallest_cell,
 )
 from morph_dslam.meshing.meshes import Mesh, faces_of_cells
-from morph_dslam.model import Parameter
-from morph_dslam.model.reduced_model import state_text
-from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
-from morph_dslam.studies.body_study import numbered, range_ends
+from morph_dslam.studies.affine import Variables
+from morph_dslam.studies.body_study import numbered
 from morph_dslam.studies.shape_sections import Shape, moved_nodes
 from morph_dslam.studies.solid_sections import MovingLineLoad, MovingPatchLoad
 
@@ -50,19 +48,16 @@ def check_widths(loads: Sequence[Any], mesh: Mesh) -> None:
             )
 
 
-def check_reach(
-    loads: Sequence[Any], mesh: Mesh, parameters: Sequence[Parameter], amplitudes: Amplitudes = NO_AMPLITUDES
-) -> None:
+def check_reach(loads: Sequence[Any], mesh: Mesh, variables: Variables) -> None:
     """Refuse moving loads that stay farther from their surface than the mesh is long (StudyError): a wrong unit.
 
     Looked at are the defaults, the ends of the parameters' ranges and states spread within.
     """
     length = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
-    states = _spread_states(parameters)
-    states += [mu for _, mu in range_ends(parameters, list(range(len(parameters))), True)]
+    states = [*_spread_states(variables), *(mu for _, mu in variables.range_ends(combined=True))]
     for where, load in _moving(loads):
         nodes = mesh.nodes[np.unique(mesh.face_triangles(_faces(mesh, load.on)))]
-        centre = [read_affine(value, "length", parameters, amplitudes) for value in load.centre]
+        centre = [variables.read(value, "length") for value in load.centre]
         places = np.unique([[c(mu) for c in centre] for mu in states], axis=0)
         distance = min(float(_distances(load, nodes, place).min()) for place in places)
         if distance > length:
@@ -72,11 +67,11 @@ def check_reach(
             )
 
 
-def _spread_states(parameters: Sequence[Parameter]) -> list[Array]:
+def _spread_states(variables: Variables) -> list[Array]:
     """The defaults (d,) of the parameters, and states spread within their ranges."""
-    within = np.random.default_rng(0).uniform(size=(TRIED, len(parameters)))
-    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
-    return [np.array([p.default for p in parameters]), *(lower + within * (upper - lower))]
+    within = np.random.default_rng(0).uniform(size=(TRIED, len(variables.parameters)))
+    lower, upper = (np.array([getattr(p, end) for p in variables.parameters]) for end in ("lower", "upper"))
+    return [variables.defaults, *(lower + within * (upper - lower))]
 
 
 def _distances(load: Moving, nodes: Array, centre: Array) -> Array:
@@ -88,13 +83,7 @@ def _distances(load: Moving, nodes: Array, centre: Array) -> Array:
     return np.linalg.norm(arms, axis=1)
 
 
-def landing_warnings(
-    loads: Sequence[Any],
-    mesh: Mesh,
-    parameters: Sequence[Parameter],
-    shape: Shape = (),
-    amplitudes: Amplitudes = NO_AMPLITUDES,
-) -> list[str]:
+def landing_warnings(loads: Sequence[Any], mesh: Mesh, variables: Variables, shape: Shape = ()) -> list[str]:
     """A sentence for each moving load a part of whose force falls beside its surface.
 
     Looked at are the defaults of the parameters, and the ends of the ranges of those that move the load or the shape.
@@ -102,9 +91,9 @@ def landing_warnings(
     """
     found = []
     for where, load in _moving(loads):
-        centre = [read_affine(value, "length", parameters, amplitudes) for value in load.centre]
+        centre = [variables.read(value, "length") for value in load.centre]
         used = sorted(set[int]().union(*(value.used for value in (*centre, *(moved for moved, _ in shape)))))
-        states = [np.array([p.default for p in parameters]), *(mu for _, mu in range_ends(parameters, used, True))]
+        states = [variables.defaults, *(mu for _, mu in variables.range_ends(used, combined=True))]
         faces = mesh.face_triangles(_faces(mesh, load.on))
 
         def share(mu: Array, load: Moving = load, faces: Any = faces, centre: Any = centre) -> float:
@@ -116,10 +105,10 @@ def landing_warnings(
             continue
         place = np.array([c(states[worst]) for c in centre])
         why = _why_beside(load, moved_nodes(mesh, shape, states[worst]), faces, place)
-        if max(shares) <= NONE and not (used and any(share(mu) > NONE for mu in _spread_states(parameters))):
+        if max(shares) <= NONE and not (used and any(share(mu) > NONE for mu in _spread_states(variables))):
             anywhere = " anywhere in the ranges of the parameters" if used else ""
             raise StudyError(f"{where}: nothing of the force lands on '{load.on}'{anywhere}{why}")
-        at = f" where {state_text([parameters[k] for k in used], states[worst][used])}" if used else ""
+        at = f" where {variables.text(states[worst], used)}" if used else ""
         landed = f"only {100.0 * shares[worst]:.0f} %" if shares[worst] > NONE else "nothing"
         found.append(f"{where}: {landed} of the force lands on '{load.on}'{at}{why}")
     return found

@@ -7,14 +7,11 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import numpy as np
-
 from morph_dslam.mechanics.enhanced_strain import takes_enhanced_strain
 from morph_dslam.mechanics.solid_materials import NEARLY_INCOMPRESSIBLE, can_be_mixed
 from morph_dslam.mechanics.solvers.linear_solver import default_engine
 from morph_dslam.mechanics.spaces import default_order, has_mixed_form
 from morph_dslam.model import ReducedModel
-from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.body_study import BodyStudy
 from morph_dslam.studies.external import ExternalStudy
 from morph_dslam.studies.sheet_study import SheetStudy
@@ -79,12 +76,7 @@ def _locking(study: BodyStudy) -> list[str]:
     """
     if not isinstance(study, SolidStudy):
         return []
-    parameters = study.model_parameters()
-    defaults = np.array([parameter.default for parameter in parameters])
-
-    def read(value: Any, quantity: str | None) -> float:
-        return read_affine(value, quantity, parameters, study.amplitudes())(defaults)
-
+    read = study.variables().reader()
     materials = {f"'{name}'": section.make(read) for name, section in study.materials.items()}
     mesh, solver = study.solid_mesh(), study.solver
     order = solver.order or default_order(mesh)

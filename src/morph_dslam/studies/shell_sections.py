@@ -23,8 +23,7 @@ from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_surface_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.meshing.surface_checks import check_surface
-from morph_dslam.model import Parameter
-from morph_dslam.studies.affine import read_affine
+from morph_dslam.studies.affine import Variables
 from morph_dslam.studies.sections import Angle, Length, Number, PositiveLength, Section, SetName
 from morph_dslam.studies.solid_sections import (
     BodyForceLoad,
@@ -183,11 +182,11 @@ class ShellSection(Section):
         return thickness
 
 
-def thickness_warnings(section: ShellSection, mesh: Mesh, parameters: Sequence[Parameter]) -> list[str]:
+def thickness_warnings(section: ShellSection, mesh: Mesh, variables: Variables) -> list[str]:
     """A sentence if the thickness, at its largest over the parameters, is not small beside the mesh."""
-    thickness = read_affine(section.thickness, "length", parameters)
-    ends = [max(slope * p.lower, slope * p.upper) for slope, p in zip(thickness.slopes, parameters, strict=True)]
-    largest, size = thickness.constant + sum(ends), float(np.ptp(mesh.nodes, axis=0).max())
+    thickness = variables.read(section.thickness, "length")
+    ends = np.array([[p.lower, p.upper] for p in variables.parameters])
+    largest, size = thickness.extremes(ends)[1], float(np.ptp(mesh.nodes, axis=0).max())
     if largest <= THICKEST * size:
         return []
     return [
@@ -241,12 +240,11 @@ class ShellMaterialSection(Section):
         return read(getattr(self, name), "stress")
 
 
-def fibre_warnings(section: ShellMaterialSection, mesh: Mesh, parameters: Sequence[Parameter]) -> list[str]:
+def fibre_warnings(section: ShellMaterialSection, mesh: Mesh, variables: Variables) -> list[str]:
     """A sentence if another direction takes the place of the fibres' on a part of the shell alone."""
     if section.young is not None:
         return []
-    defaults = np.array([parameter.default for parameter in parameters])
-    material = section.make(lambda value, quantity: read_affine(value, quantity, parameters)(defaults))
+    material = section.make(variables.reader())
     turned = ngs.IfPos(material.outside(ngs.specialcf.normal(3)), 0.0, 1.0)
     # The space curves the cells, and lets them be curved as long as it lives.
     space, surface = DisplacementSpace(SurfaceMesh(mesh), 2), ngs.ds(bonus_intorder=FINE)

@@ -80,7 +80,7 @@ class ShellStudy(BodyStudy, Section):
     @model_validator(mode="after")
     def _check_values(self) -> ShellStudy:
         """Read every value once, so that a mistake is found before anything is solved."""
-        read_once(self._parts(), self.model_parameters())
+        read_once(self._parts(), self.variables())
         if any(getattr(part, "first", False) for part in (*self.supports, *self.loads)):
             raise ValueError("first is for solids: leave it out, or let a parameter say how much of a load acts")
         if self.material.density is None and any(load.kind == "gravity" for load in self.loads):
@@ -127,7 +127,7 @@ class ShellStudy(BodyStudy, Section):
         """The discretised shell, with the study's own elements if ``options`` name no others."""
         symbols, mesh = ParameterSymbols(self.model_parameters()), self.shell_mesh()
         check_widths(self.loads, mesh)
-        check_reach(self.loads, mesh, symbols.parameters)
+        check_reach(self.loads, mesh, self.variables())
         check_symmetry(self.supports, mesh)
         read = reader_of(symbols)
         material, thickness = self.material.make(read), self.shell.make(read)
@@ -154,9 +154,9 @@ class ShellStudy(BodyStudy, Section):
 
     def doubts(self) -> list[str]:
         """See `BodyStudy`: a thickness that is none of a shell, fibres that turn abruptly, loads beside it."""
-        mesh, parameters = self.shell_mesh(), self.model_parameters()
-        found = thickness_warnings(self.shell, mesh, parameters) + fibre_warnings(self.material, mesh, parameters)
-        return found + landing_warnings(self.loads, mesh, parameters)
+        mesh, variables = self.shell_mesh(), self.variables()
+        found = thickness_warnings(self.shell, mesh, variables) + fibre_warnings(self.material, mesh, variables)
+        return found + landing_warnings(self.loads, mesh, variables)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its cells cut into triangles, and the area of each node."""

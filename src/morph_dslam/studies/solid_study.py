@@ -23,14 +23,13 @@ from morph_dslam.mechanics.solid_materials import has_pressure
 from morph_dslam.mechanics.supports import held_still
 from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
-from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, read_affine
+from morph_dslam.studies.affine import NO_AMPLITUDES, Amplitudes, Variables
 from morph_dslam.studies.body_study import (
     BodyStudy,
     NamedSet,
     check_effect,
     check_names,
     numbered,
-    range_ends,
     read_once,
     reader_of,
     support_content,
@@ -101,7 +100,7 @@ def _check_pressures(problem: SolidProblem) -> None:
     """Raise StudyError if a material that has pressures would not have them at an end of a parameter's range."""
     symbols = problem.symbols
     for material in (region.material for region in problem.regions if region.pressures):
-        for blamed, mu in range_ends(symbols.parameters, list(range(len(symbols))), combined=False):
+        for blamed, mu in Variables(symbols.parameters).range_ends():
             symbols.set(mu)
             if not has_pressure(material):
                 name = symbols.parameters[blamed[0]].name
@@ -139,7 +138,7 @@ class SolidStudy(BodyStudy, Section):
         """Read every value once, so that a mistake is found before anything is solved."""
         parameters = self.model_parameters()
         self._check_amplitudes()
-        read_once(self._parts(), parameters, self.amplitudes())
+        read_once(self._parts(), self.variables())
         if len({material.on for material in self.materials.values()}) < len(self.materials):
             raise ValueError("two materials are on the same cell set: give each its own")
         self._check_time(parameters)
@@ -218,11 +217,12 @@ class SolidStudy(BodyStudy, Section):
         """What rests before the time begins must be there, and cannot change meanwhile."""
         assert self.time is not None
         first, begin, rest = self._applied_first(), parameters[clock].lower, self.time.rest or 0.0
+        variables = self.variables()
         if not first:
             raise ValueError("time.rest: nothing rests; say of a load or support that it is first = true")
 
         def read(value: Value, quantity: str | None) -> float:
-            found = read_affine(value, quantity, parameters, self.amplitudes())
+            found = variables.read(value, quantity)
             if found.slopes[clock] or any(product.index == clock for product in found.products):
                 raise ValueError(
                     f"'{value}' names the time, but rests before the time begins: leave out first = true, or multiply "
@@ -265,14 +265,8 @@ class SolidStudy(BodyStudy, Section):
 
     def load_doubt(self) -> str:
         """A sentence, and a space, on a load that is too large for the materials by far; else ""."""
-        return load_doubt(
-            self.loads,
-            self.couplings,
-            self.materials.values(),
-            self.solid_mesh(),
-            self.model_parameters(),
-            self.amplitudes(),
-        )
+        materials = self.materials.values()
+        return load_doubt(self.loads, self.couplings, materials, self.solid_mesh(), self.variables())
 
     # -- what the sweep asks (`morph_dslam.studies.problem.ParametricStudy`) ---------------------------
 
@@ -354,10 +348,9 @@ class SolidStudy(BodyStudy, Section):
 
     def problem(self, options: SolidOptions | None = None) -> SolidProblem:
         """The discretised solid, with the study's own elements if ``options`` name no others."""
-        parameters, mesh = self.model_parameters(), self.solid_mesh()
+        symbols, mesh = self._symbols(), self.solid_mesh()
         check_widths(self.loads, mesh)
-        check_reach(self.loads, mesh, parameters, self.amplitudes())
-        symbols = self._symbols()
+        check_reach(self.loads, mesh, self.variables())
         reader = reader_of(symbols)
         own = SolidOptions(order=self.solver.order, mixed=MIXED[self.solver.formulation], threads=self.solver.threads)
         materials = {section.on: section.make(reader) for section in self.materials.values()}
@@ -419,7 +412,7 @@ class SolidStudy(BodyStudy, Section):
         coarse = coarse_set_warnings(mesh, {name: part for name, part in self.sets.items() if name in named})
         moves = any(load.kind in ("moving_patch", "moving_line") for load in self.loads)
         shape = read_shape(self.shape, mesh, parameters) if moves else ()
-        return coarse + landing_warnings(self.loads, mesh, parameters, shape, self.amplitudes())
+        return coarse + landing_warnings(self.loads, mesh, self.variables(), shape)
 
     def model_mesh(self) -> ModelMesh:
         """The nodes of the mesh, its outer surface, its cells, the volume of each node, and what supports hold."""

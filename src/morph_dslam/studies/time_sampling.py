@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.mechanics.materials.base import Material
 from morph_dslam.reduction.line_functions import interpolate_line
-from morph_dslam.studies.affine import read_affine
-from morph_dslam.studies.body_study import range_ends
-from morph_dslam.studies.solid_sections import Value
 
 if TYPE_CHECKING:
     from morph_dslam.studies.solid_study import SolidStudy
@@ -101,15 +98,10 @@ class _Answers:
 
 def _relaxation_times(study: SolidStudy) -> list[float]:
     """Those of all Prony series, s, at the defaults and at both ends of the ranges of the parameters."""
-    parameters, found = study.model_parameters(), set[float]()
-    defaults = study.root()
-    for mu in (defaults, *(mu for _, mu in range_ends(parameters, list(range(len(parameters))), combined=False))):
-
-        def read(value: Value, quantity: str | None, mu: Array = mu) -> float:
-            return read_affine(value, quantity, parameters, study.amplitudes())(mu)
-
+    variables, found = study.variables(), set[float]()
+    for mu in (variables.defaults, *(mu for _, mu in variables.range_ends())):
         for section in study.materials.values():
-            made = section.make(read)
+            made = section.make(variables.reader(mu))
             assert isinstance(made, Material)
             found |= {float(tau) for tau in made.prony.times} if made.prony else set()
     return sorted(found)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from morph_dslam.meshing.meshes import Mesh, cell_sizes
-from morph_dslam.studies.affine import read_affine
 from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_study import SolidStudy
 
@@ -31,7 +27,7 @@ def announced_mass(study: SolidStudy | ShellStudy, mesh: Mesh) -> str | None:
         return None
     sizes = cell_sizes(mesh)
     if isinstance(study, ShellStudy):
-        thickness = study.shell.make(_at_defaults(study))
+        thickness = study.shell.make(study.variables().reader())
         return mass_text(float(sizes.sum() * thickness * sum(densities.values())))
     mass = sum(densities[name] * sizes[mesh.cells(part.on)].sum() for name, part in study.materials.items())
     return mass_text(float(mass))
@@ -66,15 +62,8 @@ def _meant(density: float) -> str:
 
 def _densities(study: SolidStudy | ShellStudy) -> dict[str, Any]:
     """Density of each material at the defaults, kg/m3, by name (a shell's has none); None of one without."""
-    read = _at_defaults(study)
+    read = study.variables().reader()
     if isinstance(study, ShellStudy):
         return {"": study.material.make(read).density}
     given = {name: "density" in part.constants for name, part in study.materials.items()}
     return {name: part.make(read).density if given[name] else None for name, part in study.materials.items()}
-
-
-def _at_defaults(study: SolidStudy | ShellStudy) -> Callable[[Any, str | None], float]:
-    """Reads values of the study at the defaults of its parameters."""
-    parameters, amplitudes = study.model_parameters(), study.amplitudes()
-    defaults = np.array([parameter.default for parameter in parameters])
-    return lambda value, quantity: read_affine(value, quantity, parameters, amplitudes)(defaults)
