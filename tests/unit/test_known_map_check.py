@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
-from morph_dslam.slam.known_map_check import focal_note
+from morph_dslam.slam.known_map_checks import focal_note
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 from morph_dslam.slam.self_calibration import estimate_camera
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
 from morph_dslam.io.trajectory import Trajectory
-from morph_dslam.slam.moved_part import moved_part
+from morph_dslam.slam.known_map_checks import moved_part
 from morph_dslam.slam.rigid_map import GOOD, Followed, RigidMap
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

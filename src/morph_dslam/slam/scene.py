@@ -32,12 +32,10 @@ from morph_dslam.slam.camera_terms import (
     terms_of,
     with_terms_of,
 )
-from morph_dslam.slam.depth_scale import check_depth_ratio
 from morph_dslam.slam.frame_images import least_distances, orientations
-from morph_dslam.slam.known_map_check import focal_note
+from morph_dslam.slam.known_map_checks import check_depth_ratio, focal_note, moved_part
 from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import load_map_and_trajectory, map_from_colmap, map_from_trajectory, save_map
-from morph_dslam.slam.moved_part import moved_part
 from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.pose import inverse, refine_pose
 from morph_dslam.slam.relocalization import bit_counts

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError
-from morph_dslam.slam.depth_scale import depth_ratio
 from morph_dslam.slam.frame_images import FrameDepth, FrameImages, FrameView
 from morph_dslam.slam.initialization import MapInitializer, MapStart
+from morph_dslam.slam.known_map_checks import depth_ratio
 from morph_dslam.slam.least_squares_matching import moved_along
 from morph_dslam.slam.local_map import LEAST_DISPARITY_PX, WINDOW
 from morph_dslam.slam.map_making import MapMaking
