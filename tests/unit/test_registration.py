@@ -15,7 +15,6 @@ from morph_dslam.io.camera_files import save_camera
 from morph_dslam.model import ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.mesh import register_mesh
-from morph_dslam.registration.mesh_error import mesh_error_factors, mesh_off_surface, with_mesh_error
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -25,7 +24,13 @@ from morph_dslam.registration.messages import (
     TurnArbitrary,
     read_warning,
 )
-from morph_dslam.registration.register import run_registration, without_points_on
+from morph_dslam.registration.register import (
+    mesh_error_factors,
+    mesh_off_surface,
+    run_registration,
+    with_mesh_error,
+    without_points_on,
+)
 from morph_dslam.registration.registration import (
     Axis,
     KeyframePose,

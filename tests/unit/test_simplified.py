@@ -3,7 +3,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from morph_dslam.registration.simplified import MOST_TRIANGLES, simplified
+from morph_dslam.registration.mesh_edges import MOST_TRIANGLES, simplified
 
 
 def finely(mesh: trimesh.Trimesh, least: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, rotation_exp
@@ -15,9 +16,8 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks
 from morph_dslam.registration.messages import NotAtRest
 from morph_dslam.registration.other_values import as_set, plausible_minima
-from morph_dslam.registration.outline_snap import DISTINCT_SHARE, distinct_states, shape_distance
+from morph_dslam.registration.outline_snap import DISTINCT_SHARE, EXCLUDED, distinct_states, shape_distance
 from morph_dslam.registration.plausible_states import MeasuredPoints
-from morph_dslam.registration.rest_check import MOVED_SHARE, not_at_rest
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import pose_starts, shape_starts
 from morph_dslam.tracking.covariance import floored_inverse
@@ -40,6 +40,11 @@ RESIDUAL_SHARE, HINT_RESIDUAL_SHARE = 0.005, 0.02
 LEAST_BESIDE = 12.0
 #: Landmarks no farther beside a line than this share of their spread along it have no pose to begin with.
 EXACT_LINE = 1e-4
+#: Landmarks that are right fit better by free parameters, as much as is said of, with this chance at most.
+REST_CHANCE = 1e-4
+#: Of landmarks that fit well at rest too, the surface must move by this share of the object's size: a lens or
+#: dimensions that are slightly off move it by less.
+MOVED_SHARE = 0.03
 #: The mirrored tilts of so many states are tried.
 MOST_TILTS = 8
 
@@ -107,11 +112,40 @@ class LandmarkFit:
         return MeasuredPoints(self.estimator, self.landmarks.points, pixels, weights, normals, variance)
 
     def not_at_rest(self, shapes: Sequence[Array]) -> NotAtRest | None:
-        """That the object is hardly at rest, as was said; shapes (d,) are where else to begin."""
-        points, pixels = self.landmarks.points, self.landmarks.pixels
-        further = pose_starts(shapes, self.estimator, points, pixels)
-        least_share = 0.0 if self.best.sigma_px > self.poor_px else MOVED_SHARE
-        return not_at_rest(self.estimator, points, pixels, self.best, further, self.click_px, least_share)
+        """That the object is hardly at rest, as was said, where landmarks fit better otherwise; None if it may be.
+
+        The statistic is F of the parameters that are set free, given the error that the landmarks show then, or that of
+        carefully set ones if that is larger. Further starts have the ``shapes`` (d,).
+        """
+        estimator, points, pixels, resting = self.estimator, self.landmarks.points, self.landmarks.pixels, self.best
+        model, d = estimator.model, len(estimator.model.study_parameters)
+        freedom = 2 * len(points) - 6 - d
+
+        def is_chance(left: float) -> bool:
+            return chance_of_better_fit(2.0 * resting.cost, left, d, freedom, self.click_px) > REST_CHANCE
+
+        # The largest F, of free parameters that explain all of it, spares most fits the search.
+        if not d or freedom < 1 or is_chance(0.0):
+            return None
+        lower, upper = estimator.box.lower.copy(), estimator.box.upper.copy()
+        lower[:d], upper[:d] = model.lower[:d], model.upper[:d]
+        free = estimator.within(replace(estimator.box, lower=lower, upper=upper))
+        starts = [resting.state, *pose_starts(shapes, estimator, points, pixels)]
+        found = free.estimate_from(points, pixels, np.ones(len(points)), starts)
+        best = next((estimate for estimate in found if np.isfinite(estimate.residuals).all()), resting)
+        motion = model.positions(best.state.parameters) - model.positions(model.default)
+        moved, size = np.linalg.norm(motion, axis=1).max(), np.linalg.norm(np.ptp(model.nodes, axis=0))
+        least_share = 0.0 if resting.sigma_px > self.poor_px else MOVED_SHARE
+        if is_chance(2.0 * best.cost) or moved < least_share * size:
+            return None
+        away = (best.state.parameters - model.default)[:d] ** 2 > EXCLUDED * np.diag(best.covariance)[:d]
+        values = zip(model.study_parameters, best.state.parameters[:d], away, strict=True)
+        given = ", ".join(
+            f"{p.name} = {p.display(v):.2g} {p.unit}".removesuffix(" 1") for p, v, is_away in values if is_away
+        )
+        if not given:
+            return None
+        return NotAtRest(resting.sigma_px, self.click_px, float(np.sqrt(2.0 * best.cost / freedom)), given)
 
 
 def fit_landmarks(

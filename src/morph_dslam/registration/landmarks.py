@@ -7,7 +7,7 @@ like one away from it) is reported and not chosen by accident.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,10 @@ from morph_dslam.errors import ArgumentError, RegistrationError, check_kind
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel
+from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.registration.initialization import undistorted_grey
 from morph_dslam.registration.landmark_binding import MOST_OF_IT, PART_OF_IT, bind_in_cameras, extent, other_unit
 from morph_dslam.registration.landmark_fit import POOR_FIT, LandmarkFit, fit_landmarks, without_parameters
-from morph_dslam.registration.landmark_sides import turned_away
 from morph_dslam.registration.messages import (
     Ambiguity,
     Ambiguous,
@@ -33,6 +33,7 @@ from morph_dslam.registration.messages import (
     DepthBehindObject,
     DepthScaleUnlikely,
     FewLandmarks,
+    LandmarksTurnedAway,
     NotAtRest,
     PoorFit,
     RegistrationWarning,
@@ -45,6 +46,7 @@ from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import shape_starts
+from morph_dslam.tracking.binding import DrawnSurface, nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M
 from morph_dslam.tracking.depth_registration import FoundByDepth, refine_by_depth, share_behind
@@ -68,6 +70,12 @@ OFF_SIGMAS = 3.0
 SAME_SHARE = 0.02
 #: More of the depths on an object than this share do not lie behind it, if they belong to its pixels.
 SEEN_THROUGH = 0.05
+#: Cosine of the angle between a face and the line of sight from which on the face is seen, and not from its edge.
+SEEN = 0.2
+#: Planes of faces that are nearer to a landmark than this share of the object's size may be what it is on.
+ON_FACE = 0.01
+#: So large a share of the landmarks has to be on sides that are not seen; single ones may be a matter of rounding.
+MOST_TURNED = 0.8
 #: Objects of another size, metres, are flagged: a mesh in millimetres that was taken for metres is such.
 SIZES = (0.005, 10.0)
 
@@ -145,7 +153,7 @@ def register_landmarks(
     covariance, notes = _with_plausible_states(fit, placed, aids)
     warnings = [*_warnings(fit, placed, moved), *notes]
     for part, seen in zip(cameras, given, strict=True):
-        warnings += turned_away(model, part.seen(placed.estimate.state), seen.points)
+        warnings += _turned_away(model, part.seen(placed.estimate.state), seen.points)
     return Registration(
         model,
         placed.estimate.state,
@@ -336,3 +344,35 @@ def _of_residuals(
         enough = -(-(unknowns + ENOUGH_SPARE) // 2)
         return FewLandmarks(len(fit.landmarks), max(best.sigma_px, click_px), enough)
     return None
+
+
+def _turned_away(model: ReducedModel, state: State, points: Array) -> Iterator[LandmarksTurnedAway]:
+    """A warning if nearly all landmarks are on faces of a closed surface that are turned away from the camera.
+
+    A landmark on an edge or a corner is on all faces that meet there.
+
+    Parameters
+    ----------
+    model : of the object.
+    state : as registered.
+    points : (k, 3) of the landmarks on the undeformed object, metres.
+    """
+    if not DrawnSurface.of(model).closed:
+        return
+    normals = _unit(triangle_normals(model.nodes, model.triangles))
+    nodes = state.camera_from_object.apply(model.positions(state.parameters))
+    towards = -nodes[model.triangles].mean(axis=1)
+    seen = np.sum(_unit(triangle_normals(nodes, model.triangles)) * _unit(towards), axis=1) > SEEN
+    nearest, _ = nearest_surface_points(model.nodes, model.triangles, points)
+    reach = ON_FACE * float(np.linalg.norm(np.ptp(model.nodes, axis=0)))
+    count = 0
+    for point, own in zip(points, nearest.triangles, strict=True):
+        beside = np.isin(model.triangles, model.triangles[own]).any(axis=1)
+        height = np.abs(np.sum((point - model.nodes[model.triangles[:, 0]]) * normals, axis=1))
+        count += not (seen & beside & (height < reach)).any()
+    if count >= MOST_TURNED * len(points):
+        yield LandmarksTurnedAway(count, len(points))
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

@@ -32,8 +32,7 @@ from morph_dslam.registration.landmark_binding import (
 )
 from morph_dslam.registration.landmark_fit import check_at_rest
 from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
-from morph_dslam.registration.mesh_error import mesh_error_factors, mesh_off_surface, with_mesh_error
-from morph_dslam.registration.messages import OnlyInBox, OtherSize
+from morph_dslam.registration.messages import MeshOffSurface, OnlyInBox, OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
     OTHER_MAP_SHIFT,
@@ -53,6 +52,7 @@ from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.tracking.anchoring import points_on_object
 
+Array = NDArray[np.float64]
 #: Landmarks in one frame from which a search begins.
 FEWEST_CLICKS = 3
 #: Points across and along a box, through a lens whose formula may fold at the rim.
@@ -194,9 +194,7 @@ def _check_number(frames: NDArray[np.int64], has_guess: bool) -> None:
         )
 
 
-def _at_middle_row(
-    scene: Scene, camera_from_world: RigidTransform, twist: NDArray[np.float64], pixels: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _at_middle_row(scene: Scene, camera_from_world: RigidTransform, twist: Array, pixels: Array) -> Array:
     """Pixels (n, 2) of a frame as of the instant of its middle row, at the depths of the map's points around them."""
     local = camera_from_world.apply(scene.points)
     known = scene.camera.project(local)
@@ -218,7 +216,7 @@ def _guessed(path: Path, scene: Scene) -> GuessedPose:
     return GuessedPose(given.guess.frame, pose, given.pose)
 
 
-def _camera_poses(scene: Scene) -> dict[int, NDArray[np.float64]]:
+def _camera_poses(scene: Scene) -> dict[int, Array]:
     """camera_from_world (4, 4) by the frames that the map has a pose for.
 
     Keyframes of a map that was known before have numbers of another recording than the path: a number that stands for
@@ -234,7 +232,7 @@ def _camera_poses(scene: Scene) -> dict[int, NDArray[np.float64]]:
     return poses
 
 
-def _is_elsewhere(one: NDArray[np.float64], other: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
+def _is_elsewhere(one: Array, other: Array, points: Array) -> bool:
     """Whether two camera_from_world (4, 4) in a map of points (n, 3) are surely not of one frame."""
     between = one @ np.linalg.inv(other)
     ahead = np.linalg.norm(RigidTransform.from_matrix(other).apply(points), axis=1)
@@ -243,7 +241,7 @@ def _is_elsewhere(one: NDArray[np.float64], other: NDArray[np.float64], points: 
     return bool(turn > OTHER_MAP_TURN or np.linalg.norm(between[:3, 3]) > near)
 
 
-def _camera_velocities(scene: Scene) -> dict[int, NDArray[np.float64]]:
+def _camera_velocities(scene: Scene) -> dict[int, Array]:
     """Velocities (6,) of a rolling shutter by frames of its path; none of a global one."""
     path = scene.trajectory
     if not scene.camera.readout_s:
@@ -251,7 +249,7 @@ def _camera_velocities(scene: Scene) -> dict[int, NDArray[np.float64]]:
     return dict(zip(path.indices.tolist(), velocities(path.timestamps, path.camera_from_world), strict=True))
 
 
-def _camera_in(poses: dict[int, NDArray[np.float64]], frame: int, hint: str) -> RigidTransform:
+def _camera_in(poses: dict[int, Array], frame: int, hint: str) -> RigidTransform:
     """The camera's pose in a frame that a hint names; raises RegistrationError if the map has none."""
     if frame not in poses:
         nearest = min(poses, key=lambda other: abs(other - frame))
@@ -292,6 +290,44 @@ def _keyframes(found: MeshRegistration, views: Sequence[View]) -> list[KeyframeP
         else:
             poses.append(KeyframePose(view.frame, adjusted.poses[k], adjusted.covariance_of(k), factors[k]))
     return poses
+
+
+def mesh_off_surface(model: ReducedModel) -> MeshOffSurface | None:
+    """How far a model's mesh is off the surface that it was made from, as its file says; None if it is not off."""
+    found = model.certificate.get("mesh_deviation")
+    return found and MeshOffSurface(float(found["volume"]), float(found["mean_m"]))
+
+
+def mesh_error_factors(off: MeshOffSurface, nodes: Array, scale: float) -> Array:
+    """Standard deviations (7,) of log scale, rotation vector (rad) and translation (map units).
+
+    The object is taken for larger or nearer by the cube root of the volume, and the distance may be the same all over
+    the side that is seen, which shifts it, or opposite at its ends, which tilts it.
+
+    Parameters
+    ----------
+    off : how far the mesh is off.
+    nodes : (n, 3) of the undeformed mesh, metres.
+    scale : map units per metre.
+    """
+    radius = float(np.sqrt(np.mean(np.sum((nodes - nodes.mean(axis=0)) ** 2, axis=1))))
+    return np.array([abs(off.volume) / 3.0, *3 * [off.mean / radius], *3 * [scale * off.mean]])
+
+
+def with_mesh_error(
+    in_map: MapRegistration, keyframes: Sequence[KeyframePose], factors: Array
+) -> tuple[MapRegistration, list[KeyframePose]]:
+    """A registration and its keyframes' poses with further error factors (7,), which all keyframes have in common."""
+    if in_map.covariance is not None:
+        in_map = replace(in_map, covariance=in_map.covariance + np.diag(factors**2))
+    poses = []
+    for view in keyframes:
+        more = in_map.slopes(view.pose) * factors
+        if view.covariance is not None and view.error_factors is not None:
+            both = np.hstack([view.error_factors, more])
+            view = replace(view, covariance=view.covariance + more @ more.T, error_factors=both)
+        poses.append(view)
+    return in_map, poses
 
 
 def run_registration(
