@@ -40,8 +40,8 @@ from morph_dslam.extend import run_and_report_errors, threads_side_by_side
 from morph_dslam.extend.registration import run_registration
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources.live import PacedRecording
-from morph_dslam.tracking.drawing import AugmentedView
-from morph_dslam.tracking.sinks import LivePicture, LiveTimes, TrackedFrame, VideoSink
+from morph_dslam.tracking.drawing import AugmentedPicture, AugmentedView
+from morph_dslam.tracking.sinks import LiveTimes, TrackedFrame, VideoSink
 from morph_dslam.tracking.track import new_session, prepare, warm_up
 from support import data_folder, keep, keep_sequence
 
@@ -180,7 +180,7 @@ def run(arguments: argparse.Namespace) -> None:
             for stage, milliseconds in result.timings_ms.items():
                 stages[stage].append(milliseconds)
 
-        picture = LivePicture(seal.camera, {seal.name: AugmentedView(seal.model, seal.camera)})
+        picture = AugmentedPicture(seal.camera, {seal.name: AugmentedView(seal.model, seal.camera)})
         session = new_session(placed, stream, [times, record, note], picture=picture)
         picture.draw, session.locate, session.track = map(Timed, (picture.draw, session.locate, session.track))
         begin = time.process_time()

@@ -14,12 +14,11 @@ from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import load_model
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import Frame, open_source
-from morph_dslam.tracking.drawing import AugmentedView, DrawOptions
+from morph_dslam.tracking.drawing import AugmentedPicture, AugmentedView, DrawOptions
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.outcomes import ObjectMoved, Status
 from morph_dslam.tracking.placement import new_anchor
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.sinks import LivePicture
 from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN
 from tests.support.tracked_rig import column, errors, exact_nodes, placed_objects
@@ -350,7 +349,7 @@ def test_the_nearest_object_is_drawn_over_the_others(recording):
     folder, truth = recording
     models = {name: load_model(folder / f"{name}.morph") for name in ("wedge", "sheet")}
     drawing, camera = DrawOptions("displacement"), RIG[0].camera
-    picture = LivePicture(camera, {name: AugmentedView(model, camera, drawing) for name, model in models.items()})
+    picture = AugmentedPicture(camera, {name: AugmentedView(model, camera, drawing) for name, model in models.items()})
     frame = Frame(FRAMES - 1, 0.0, np.full((360, 480, 3), 90, np.uint8))
     results = {name: result_of(folder, truth, name, FRAMES - 1) for name in models}
     lost = {name: FrameResult(model, Status.LOST) for name, model in models.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import starmap
 from pathlib import Path
@@ -28,6 +28,7 @@ from morph_dslam.render.shading import lambert, text_patch, vertex_normals
 from morph_dslam.sources import Frame, FrameSource
 from morph_dslam.threads import ahead, threads_side_by_side
 from morph_dslam.tracking.binding import DrawnSurface, View, facing
+from morph_dslam.tracking.compilation import compile_drawing
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.force_arrows import ForceArrows
@@ -349,6 +350,51 @@ def _drawn_mesh(model: ReducedModel, section: SectionPlane | None) -> tuple[Mate
     return points, np.concatenate([triangles, cut_open + len(left)])
 
 
+class AugmentedPicture:
+    """Draws a tracked frame: undistorted, with the objects over it, or the reason why one is not there.
+
+    Parameters
+    ----------
+    camera : whose frames are drawn.
+    views : by object; all of the same field, with one range of colours.
+    limits : of these colours; where absent, those of all states of the parameter boxes.
+    """
+
+    def __init__(
+        self, camera: Camera, views: Mapping[str, AugmentedView], limits: tuple[float, float] | None = None
+    ) -> None:
+        compile_drawing()
+        if limits is None:
+            coloured = [view for view in views.values() if view.label] or list(views.values())
+            ranges = np.array([view.range_of_box() for view in coloured])
+            limits = float(ranges[:, 0].min()), float(ranges[:, 1].max())
+        self._views, self._limits = dict(views), limits
+        self._maps = camera.undistortion_maps()
+
+    def draw(self, frame: Frame, results: Mapping[str, FrameResult]) -> NDArray[np.uint8]:
+        """The picture, the nearest object over the others."""
+        image, caption = frame.image, f"frame {frame.index}"
+        if self._maps is not None:
+            image = np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+        missing = {
+            name: f"{result.status}: {result.reason}" for name, result in results.items() if result.estimate is None
+        }
+        if missing and len(results) == 1:
+            caption = f"{caption}: {next(iter(missing.values()))}"
+        elif missing:
+            caption = "; ".join([caption, *(f"{name}: {why}" for name, why in missing.items())])
+        if len(missing) == len(results):
+            return with_caption(image, caption)
+        found = [
+            (self._views[name], result.shown_state, result)
+            for name, result in results.items()
+            if result.shown_state is not None
+        ]
+        for view, state, result in sorted(found, key=lambda one: -one[0].distance(one[1])):
+            image = view.draw(image, state, self._limits, caption, result.discrepancy, result.jumps)
+        return image
+
+
 #: At most so many states are looked at for the range of colours.
 MOST_STATES = 60
 
@@ -357,27 +403,17 @@ def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults
     """Draw every frame of the run that the source has; hidden and lost ones are shown as they are, with the reason."""
     known = [state for state in run.states() if state is not None]
     limits = view.range_of(known[:: max(1, len(known) // MOST_STATES)])
-    maps = camera.undistortion_maps()
-
-    def drawn(result: FrameResult, frame: Frame) -> NDArray[np.uint8]:
-        image = frame.image
-        if maps is not None:
-            image = np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-        state = result.shown_state
-        if state is None:
-            return with_caption(image, f"frame {frame.index}: {result.status}: {result.reason}")
-        return view.draw(image, state, limits, f"frame {frame.index}", result.discrepancy, result.jumps)
-
+    picture = AugmentedPicture(camera, {run.model.name: view}, limits)
     results = dict(zip(run.frames, run.results, strict=True))
 
-    def rows() -> Iterator[tuple[FrameResult, Frame]]:
+    def rows() -> Iterator[tuple[Frame, dict[str, FrameResult]]]:
         # Frames that may be missing after those of the run are read ahead, but never asked for.
         for frame in ahead(iter(source)):
             if frame.index in results:  # of a rig, either may lack some
-                yield results[frame.index], frame
+                yield frame, {run.model.name: results[frame.index]}
             if frame.index >= run.frames[-1]:
                 return
 
     with VideoWriter(path, source.fps, (camera.width, camera.height)) as video, threads_side_by_side():
-        for image in tqdm(ahead(starmap(drawn, rows())), total=len(run), desc="drawing", unit="frame"):
+        for image in tqdm(ahead(starmap(picture.draw, rows())), total=len(run), desc="drawing", unit="frame"):
             video.write(image)

@@ -14,11 +14,12 @@ from morph_dslam.sources.frames import check_frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.anchoring import Anchor
+from morph_dslam.tracking.drawing import AugmentedPicture
 from morph_dslam.tracking.live import LivePipeline
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
 from morph_dslam.tracking.reregistration import Reregistration
-from morph_dslam.tracking.sinks import LivePicture, Sink, TrackedFrame
+from morph_dslam.tracking.sinks import Sink, TrackedFrame
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from morph_dslam.tracking.tracker_inputs import Picture
 
@@ -59,7 +60,7 @@ class Session:
         sinks: Sequence[Sink] = (),
         *,
         anchor: Anchor | None = None,
-        picture: LivePicture | None = None,
+        picture: AugmentedPicture | None = None,
         reregistration: Mapping[str, Reregistration] | None = None,
     ) -> None:
         check_kind(trackers, Mapping, "trackers", "a tracker of each object by its name, {'object': tracker}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
@@ -15,14 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
 from morph_dslam.errors import TrackingError
 from morph_dslam.io.local_server import LocalHandler, local_server
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame
 from morph_dslam.sources.local_socket import SocketCamera
-from morph_dslam.tracking.compilation import compile_drawing
-from morph_dslam.tracking.drawing import AugmentedView, with_caption
 from morph_dslam.tracking.repeated_pictures import RepeatedPictures
 from morph_dslam.tracking.result import FrameResult
 
@@ -98,46 +95,6 @@ class LiveTimes:
             writer.writerow(["frame", "captured_s", "latency_ms"])
             for frame, captured, latency in zip(self.frames, self.captured, self.latency, strict=True):
                 writer.writerow([frame, f"{captured - self.captured[0]:.6f}", f"{1e3 * latency:.3f}"])
-
-
-class LivePicture:
-    """Draws a tracked frame: undistorted, with the objects over it, or the reason why one is not there.
-
-    Parameters
-    ----------
-    camera : whose frames are drawn.
-    views : by object; all of the same field, with one range of colours.
-    """
-
-    def __init__(self, camera: Camera, views: Mapping[str, AugmentedView]) -> None:
-        compile_drawing()
-        coloured = [view for view in views.values() if view.label] or list(views.values())
-        ranges = np.array([view.range_of_box() for view in coloured])
-        self._views, self._limits = dict(views), (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
-        self._maps = camera.undistortion_maps()
-
-    def draw(self, frame: Frame, results: Mapping[str, FrameResult]) -> NDArray[np.uint8]:
-        """The picture, the nearest object over the others."""
-        image, caption = frame.image, f"frame {frame.index}"
-        if self._maps is not None:
-            image = np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-        missing = {
-            name: f"{result.status}: {result.reason}" for name, result in results.items() if result.estimate is None
-        }
-        if missing and len(results) == 1:
-            caption = f"{caption}: {next(iter(missing.values()))}"
-        elif missing:
-            caption = "; ".join([caption, *(f"{name}: {why}" for name, why in missing.items())])
-        if len(missing) == len(results):
-            return with_caption(image, caption)
-        found = [
-            (self._views[name], result.shown_state, result)
-            for name, result in results.items()
-            if result.shown_state is not None
-        ]
-        for view, state, result in sorted(found, key=lambda one: -one[0].distance(one[1])):
-            image = view.draw(image, state, self._limits, caption, result.discrepancy, result.jumps)
-        return image
 
 
 JPEG_QUALITY = 80

@@ -33,7 +33,7 @@ from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.camera_check import CameraCheck
 from morph_dslam.tracking.combinations import check_depth, check_inputs, check_options, check_times
 from morph_dslam.tracking.discrepancy import DiscrepancyFit, Reference, refine_discrepancy
-from morph_dslam.tracking.drawing import AugmentedView, DrawOptions, write_video
+from morph_dslam.tracking.drawing import AugmentedPicture, AugmentedView, DrawOptions, write_video
 from morph_dslam.tracking.frame_log import FrameLog, check_frame_log
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.options import NOT_IN_EQUILIBRIUM
@@ -55,7 +55,7 @@ from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.setup import TrackedObject, load_cameras, load_objects
-from morph_dslam.tracking.sinks import BrowserSink, LivePicture, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
+from morph_dslam.tracking.sinks import BrowserSink, LiveTimes, Sink, SourceSink, TrackedFrame, VideoSink
 from morph_dslam.tracking.still_run import OpenedSurface, Sharpening, known_state, with_pose, with_still_pose
 from morph_dslam.tracking.stream_sink import StreamedObject, StreamSink
 from morph_dslam.tracking.synchronized import SynchronizedFrames
@@ -261,7 +261,7 @@ class _Job:
         else:
             streams = self._begun_streams(placed)
         views = {part.name: view for part, view in zip(placed, self._views, strict=True)}
-        picture = LivePicture(placed[0].camera, views) if screens else None
+        picture = AugmentedPicture(placed[0].camera, views) if screens else None
         self._session = new_session(
             placed, source, self._between_interrupts(sinks, streams), picture=picture, reregistration=self._again
         )
