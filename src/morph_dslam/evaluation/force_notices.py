@@ -13,7 +13,6 @@ from morph_dslam.evaluation.frame_numbers import (
     CLEARLY,
     FEWEST_FORCES,
     HOW_FRAMES_COUNT,
-    Correction,
     fit_columns,
     force_shift,
     in_words,
@@ -120,7 +119,7 @@ class OtherFrameNumbers(ForceNotice):
     def of(cls, name: str, frames: Array, modelled: Array, places: Array, measured: Array) -> OtherFrameNumbers | None:
         """The notice that forces need, if they do; see `force_shift`."""
         found = force_shift(frames, modelled, places, measured)
-        return None if found is None else cls(name, int(found.by), found.factor, found.rms, found.rms_as_given)
+        return None if found is None else cls(name, *found)
 
 
 @dataclass(frozen=True)
@@ -147,11 +146,31 @@ class OtherPlaceUnit(ForceNotice):
 
     @classmethod
     def of(cls, quantity: str, curve: ForceCurve, places: Array, modelled: Array) -> OtherPlaceUnit | None:
-        """The notice that a curve needs, if it does; see `_place_scale`."""
-        found = _place_scale(quantity, curve, places, modelled)
-        if found is None:
-            return None
-        return cls(curve.name, curve.against, found.by, found.factor, found.rms, found.rms_as_given)
+        """The notice that a curve needs, if a smaller unit of its places explains a factor of its forces.
+
+        A factor up to `ALIKE`, or its inverse, needs no explanation. With a smaller unit more of the curve is compared,
+        which no noise and no other law makes straighter. A larger one is not tried: any short piece of a curve is
+        straight. Most frames are then off the curve as it is given.
+
+        Parameters
+        ----------
+        quantity : of the parameter that the curve is given by.
+        places : (e,) the parameter in frames of the run.
+        modelled : (e,) the model's force there.
+        """
+        order = np.argsort(curve.places, kind="stable")
+        known, forces = curve.places[order], curve.forces[order]
+        found = list[OtherPlaceUnit]()
+        for scale in smaller_units(quantity):
+            inside = (places >= scale * known[0]) & (places <= scale * known[-1])
+            if inside.sum() < FEWEST_FORCES:
+                continue
+            (given, _), before = fit_columns(np.interp(places[inside], known, forces), modelled[inside])
+            (factor, _), rms = fit_columns(np.interp(places[inside], scale * known, forces), modelled[inside])
+            is_size = 1.0 / ALIKE <= factor <= ALIKE and not 1.0 / ALIKE <= given <= ALIKE
+            if is_size and before > CLEARLY * rms:
+                found.append(cls(curve.name, curve.against, scale, float(factor), rms, before))
+        return min(found, key=lambda each: each.rms, default=None)
 
 
 @dataclass(frozen=True)
@@ -171,34 +190,6 @@ class NeighboursAlike(ForceNotice):
     )
     durbin_watson: float
     picture: str
-
-
-def _place_scale(quantity: str, curve: ForceCurve, places: Array, modelled: Array) -> Correction | None:
-    """Whether a smaller unit of a curve's places explains a factor of its forces, and what that leaves.
-
-    A factor up to `ALIKE`, or its inverse, needs no explanation. With a smaller unit more of the curve is compared,
-    which no noise and no other law makes straighter. A larger one is not tried: any short piece of a curve is straight.
-    Most frames are then off the curve as it is given.
-
-    Parameters
-    ----------
-    quantity : of the parameter that the curve is given by.
-    places : (e,) the parameter in frames of the run.
-    modelled : (e,) the model's force there.
-    """
-    order = np.argsort(curve.places, kind="stable")
-    known, forces = curve.places[order], curve.forces[order]
-    found = []
-    for scale in smaller_units(quantity):
-        inside = (places >= scale * known[0]) & (places <= scale * known[-1])
-        if inside.sum() < FEWEST_FORCES:
-            continue
-        (given, _), before = fit_columns(np.interp(places[inside], known, forces), modelled[inside])
-        (factor, _), rms = fit_columns(np.interp(places[inside], scale * known, forces), modelled[inside])
-        is_size = 1.0 / ALIKE <= factor <= ALIKE and not 1.0 / ALIKE <= given <= ALIKE
-        if is_size and before > CLEARLY * rms:
-            found.append(Correction(scale, float(factor), rms, before))
-    return min(found, key=lambda each: each.rms, default=None)
 
 
 def force_notices(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,24 +91,9 @@ def _notes(mean_error: Callable[[int], float], of: str, unit: str) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class Correction:
-    """What is wrong with where forces were measured: their frame numbers, or the unit of their places.
-
-    Attributes
-    ----------
-    by : what each number lacks, one of `SHIFTS`; or what the places have to be multiplied by.
-    factor : of the model's forces, once corrected.
-    rms, rms_as_given : of what the factor and an offset leave then, and as it was given.
-    """
-
-    by: float
-    factor: float
-    rms: float
-    rms_as_given: float
-
-
-def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) -> Correction | None:
+def force_shift(
+    frames: Array, modelled: Array, places: Array, measured: Array
+) -> tuple[int, float, float, float] | None:
     """Whether other frame numbers of measured forces explain what a factor and an offset leave.
 
     Parameters
@@ -117,6 +102,11 @@ def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) 
     modelled : (e,) the model's force there.
     places : (k,) frame numbers of the measured forces.
     measured : (k,).
+
+    Returns
+    -------
+    What each number lacks, one of `SHIFTS`; the factor of the model's forces then; the rms of what this and an offset
+    leave then, and as the numbers were given.
     """
     of = dict(zip(frames.tolist(), modelled.tolist(), strict=True))
     # Only those with forces of the model for each shift and on both sides of it, so that all shifts compare the same.
@@ -133,7 +123,7 @@ def force_shift(frames: Array, modelled: Array, places: Array, measured: Array) 
     (scale, late, _), _ = fit_columns(measured[rows], at[best], (at[best + 1] - at[best - 1]) / 2.0)
     if not abs(late) <= WHOLE * abs(scale):
         return None
-    return Correction(best, float(factor), rms, fits[0][1])
+    return best, float(factor), rms, fits[0][1]
 
 
 def fit_columns(measured: Array, *columns: Array) -> tuple[Array, float]:
