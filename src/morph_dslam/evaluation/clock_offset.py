@@ -58,10 +58,13 @@ def _error(estimate: Trajectory, truth: Trajectory, offset: float) -> float:
     shared = (times >= truth.timestamps[0]) & (times <= truth.timestamps[-1])
     if shared.sum() < max(3.0, LEAST_OVERLAP * min(len(times), len(truth))):
         return np.inf
-    own = estimate.positions[shared]
-    true = _positions_at(truth, times[shared])
+    return aligned_error(estimate.positions[shared], _positions_at(truth, times[shared]))
+
+
+def aligned_error(own: Array, true: Array, with_scale: bool = True) -> float:
+    """Root mean square distance of points (n, 3) after the best similarity or motion; infinite where there is none."""
     try:
-        motion = fit_similarity(own, true, with_scale=True)
+        motion = fit_similarity(own, true, with_scale)
     except ValueError:
         return np.inf
     return float(np.sqrt(np.mean(np.sum((motion.apply(own) - true) ** 2, axis=1))))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.errors import EvaluationError
-from morph_dslam.evaluation.clock_offset import clock_offset
+from morph_dslam.evaluation.clock_offset import aligned_error, clock_offset
 from morph_dslam.geometry import fit_similarity, rotation_log
 from morph_dslam.io.trajectory import Trajectory, other_conventions
 from morph_dslam.slam.run_notes import LONGEST_INTERVAL_S
@@ -114,17 +114,8 @@ def _best_convention(estimate: Trajectory, truth: Trajectory) -> tuple[str, Traj
     ]
     turns = np.array([_turn_difference(own, true) for _, own, true in ways])
     alike = np.flatnonzero(turns <= CLEARLY * turns.min() + ROUNDING_DEG)
-    errors = np.array([_position_error(*ways[row][1:]) for row in alike])
+    errors = np.array([aligned_error(*(path.positions for path in ways[row][1:])) for row in alike])
     return ways[alike[np.flatnonzero(errors <= CLEARLY * errors.min())[0]]]
-
-
-def _position_error(estimate: Trajectory, truth: Trajectory, with_scale: bool = True) -> float:
-    """Root mean square distance of the centres after the best similarity or motion; infinite where there is none."""
-    try:
-        motion = fit_similarity(estimate.positions, truth.positions, with_scale)
-    except ValueError:
-        return np.inf
-    return float(np.sqrt(np.mean(np.sum((motion.apply(estimate.positions) - truth.positions) ** 2, axis=1))))
 
 
 def _axes_of_body(estimate: Trajectory, truth: Trajectory) -> Array:
@@ -162,7 +153,7 @@ def _lever_notes(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
     if rank < len(values):  # the path does not turn enough to tell
         return
     left = np.hstack(columns) @ values - truth.positions.ravel()
-    after, before = float(np.sqrt(left @ left / n)), _position_error(estimate, truth)
+    after, before = float(np.sqrt(left @ left / n)), aligned_error(estimate.positions, truth.positions)
     if before > max(CLEARLY * after, LEAST_ERROR_M) and float(values[3]) > 0.0:
         lever = ", ".join(f"{value:.0f}" for value in 1e3 * values[:3])
         yield (
@@ -237,8 +228,8 @@ def no_scale(estimate: Trajectory, truth: Trajectory, is_metric: bool) -> str:
     own, true = _extent(estimate), _extent(truth)
     if min(own, true) < STILL_M:
         return f"the {'true' if true < STILL_M else 'estimated'} path stands still, and a still path has no scale"
-    off = _position_error(estimate, truth, with_scale=False) if is_metric else 0.0
-    if true < off and _position_error(estimate, truth) ** 2 > (1.0 - EXPLAINED) * true**2:
+    off = aligned_error(estimate.positions, truth.positions, with_scale=False) if is_metric else 0.0
+    if true < off and aligned_error(estimate.positions, truth.positions) ** 2 > (1.0 - EXPLAINED) * true**2:
         return (
             f"the true path spreads by {1e3 * true:.2g} mm about its middle, less than the estimate is off "
             f"({1e3 * off:.2g} mm), and has no scale"
