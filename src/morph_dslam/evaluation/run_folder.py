@@ -74,7 +74,7 @@ class Run:
         if not results:
             raise EvaluationError("there are no results to make a run of: give that of at least one frame")
         found = list(results.values())
-        lost = np.full((4, 4), np.nan)
+        lost, unknown = np.full((4, 4), np.nan), np.full(len(found[0].model.parameters), np.nan)
         return cls(
             model=found[0].model,
             camera=camera,
@@ -82,10 +82,10 @@ class Run:
             status=tuple(str(result.status.value) for result in found),
             reasons=tuple(result.reason for result in found),
             camera_from_object=np.array([lost if r.pose is None else r.pose.matrix for r in found]),
-            parameters=np.array([_parameters(result) for result in found]),
+            parameters=np.array([unknown if r.estimate is None else r.estimate.state.parameters for r in found]),
             stage_times={"total": np.array([result.total_ms for result in found])},
             discrepancies={row: r.discrepancy for row, r in enumerate(found) if r.discrepancy is not None},
-            covariances=np.array([_covariance(result) for result in found]),
+            covariances=np.array([result.covariance for result in found]),
         )
 
     @property
@@ -111,18 +111,6 @@ class Run:
         if row in self.discrepancies:
             positions = positions + self.discrepancies[row].displacement(self.model.nodes)
         return pose.apply(positions)
-
-
-def _parameters(result: FrameResult) -> Array:
-    """(d,), NaN where lost."""
-    lost = np.full(len(result.model.parameters), np.nan)
-    return lost if result.estimate is None else result.estimate.state.parameters
-
-
-def _covariance(result: FrameResult) -> Array:
-    """(d + 6, d + 6), NaN where lost."""
-    lost = np.full((len(result.model.parameters) + 6,) * 2, np.nan)
-    return lost if result.estimate is None else result.estimate.covariance
 
 
 def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
