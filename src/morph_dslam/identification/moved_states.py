@@ -7,7 +7,6 @@ all states leaves that to the parameters, which take it up: a yielding stand pas
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,22 +24,8 @@ CHANCE = 1e-4
 ROUNDING = 1e-6
 
 
-@dataclass(frozen=True)
-class MovedStates:
-    """Points that fit better with motions that differ from state to state.
-
-    Attributes
-    ----------
-    rms : of what is missed with them, m.
-    with_load : whether motions in proportion to known parameters are enough.
-    """
-
-    rms: float
-    with_load: bool
-
-
-def moved_states(misfit: Misfit, points: MeasuredPoints) -> MovedStates | None:
-    """That points show more than one rigid motion; None where they do not, or are not aligned.
+def moved_states(misfit: Misfit, points: MeasuredPoints) -> dict[str, Any] | None:
+    """That points show more than one rigid motion, plain JSON; None where they do not, or are not aligned.
 
     The statistic is F of the further motions, given the error that the points show with them, or that of the model if
     it is larger. It is asked of motions in proportion to known parameters, and of one of each state beyond these. What
@@ -50,6 +35,11 @@ def moved_states(misfit: Misfit, points: MeasuredPoints) -> MovedStates | None:
     ----------
     misfit : of the points.
     points : as measured.
+
+    Returns
+    -------
+    ``rms`` of what is missed with motions that differ from state to state, in the unit of reports, and ``with_load``,
+    whether motions in proportion to known parameters are enough.
     """
     names = np.array(points.value_states)
     states = list(dict.fromkeys(points.value_states))
@@ -65,9 +55,9 @@ def moved_states(misfit: Misfit, points: MeasuredPoints) -> MovedStates | None:
     # Each of two questions has half the chance.
     by_each, rms = _chance(misfit.missed, np.hstack([null, in_proportion]), of_each, least)
     if by_each < CHANCE / 2.0:
-        return MovedStates(rms, with_load=False)
+        return {"rms": points.scale * rms, "with_load": False}
     by_load, rms = _chance(misfit.missed, null, in_proportion, least)
-    return MovedStates(rms, with_load=True) if by_load < CHANCE / 2.0 else None
+    return {"rms": points.scale * rms, "with_load": True} if by_load < CHANCE / 2.0 else None
 
 
 def moved_state_notes(each: Mapping[str, Any]) -> list[str]:

@@ -107,10 +107,8 @@ def _misfit_figures(misfit: Misfit, found: Identification) -> dict[str, Any]:
 
 def _motion_figures(misfit: Misfit, points: MeasuredPoints) -> dict[str, Any]:
     """Those of points that were aligned."""
-    found = moved_states(misfit, points)
-    states = None if found is None else {"rms": points.scale * found.rms, "with_load": found.with_load}
     moved = np.sqrt(3.0) * points.scale * root_mean_square(misfit.adjustment)
-    return {"moved_rms": moved, "states_moved": states}
+    return {"moved_rms": moved, "states_moved": moved_states(misfit, points)}
 
 
 def _force_figures(
