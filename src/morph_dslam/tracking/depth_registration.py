@@ -91,7 +91,7 @@ def refine_by_depth(
     RegistrationError
         If there is hardly any depth where the landmarks have the object.
     """
-    fit, factor, share_near = None, 1.0, 0.0
+    found, factor = None, 1.0
     for number in range(ROUNDS):
         # At first all of them may be off together, by what the scale of the depth camera may be.
         begin = (0.0, 0.0) if number else (SCALE_SIGMAS * scale_std, off)
@@ -106,30 +106,11 @@ def refine_by_depth(
                 f"--depth-per-metre, {DEPTH_SCALE}, or the landmarks"
             )
         term = _term(estimator, state, points, places, depths).scaled(1.0 / factor)
-        fit = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state, scale_std).minimum()
-        state, factor, share_near = fit.best.state, fit.scale.factor, depths.count / measured.count
-    assert fit is not None
-    estimate = estimator.finished(fit.best, np.ones(len(pixels)), np.full(len(pixels), 2))
-    estimate = replace(estimate, covariance=estimate.covariance + np.outer(fit.by_scale, fit.by_scale))
-    return FoundByDepth(estimate, fit.scale, fit.deviations, fit.best.cost / sigma_px**2, share_near)
-
-
-@dataclass(frozen=True)
-class _FittedDepth:
-    """Where landmarks and depth fit best.
-
-    Attributes
-    ----------
-    best : the Hessian is that of all unknowns, at the scale of the depths that was found.
-    scale : of the depths.
-    deviations : as of `FoundByDepth`.
-    by_scale : (d + 6,) by which one standard deviation of the scale moves the state, to first order.
-    """
-
-    best: Minimum
-    scale: DepthScale
-    deviations: float
-    by_scale: Array
+        fit = _DepthFit(estimator, landmarks, pixels, sigma_px, term, state, scale_std)
+        found = fit.found(depths.count / measured.count)
+        state, factor = found.estimate.state, found.scale.factor
+    assert found is not None
+    return found
 
 
 class _DepthFit:
@@ -152,7 +133,7 @@ class _DepthFit:
         self._sigma_px, self._term, self._start = sigma_px, term, start
         self._scale, self._scale_std = STEP * estimator.box.scale, scale_std
 
-    def minimum(self) -> _FittedDepth:
+    def found(self, share_near: float) -> FoundByDepth:
         """Where all fits best, parameters that are known held."""
         box, d = self._estimator.box, len(self._start.parameters)
         free = np.concatenate([box.upper > box.lower, np.ones(7, dtype=bool)])
@@ -174,7 +155,10 @@ class _DepthFit:
         by_scale = np.zeros(d + 6)
         by_scale[free] = std * self._scale[free] * followed
         scale = DepthScale(1.0 + self._scale_std * float(step[-1]), std * self._scale_std)
-        return _FittedDepth(best, scale, float(step[-1]), by_scale)
+        estimate = self._estimator.finished(best, np.ones(len(self._pixels)), np.full(len(self._pixels), 2))
+        # To first order one standard deviation of the scale moves the state by this.
+        estimate = replace(estimate, covariance=estimate.covariance + np.outer(by_scale, by_scale))
+        return FoundByDepth(estimate, scale, float(step[-1]), best.cost / variance, share_near)
 
     def _at(self, step: Array) -> State:
         return self._estimator.box.nearest(moved(self._start, step[:-1] * self._scale))
