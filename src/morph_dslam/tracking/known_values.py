@@ -87,13 +87,14 @@ class KnownValues:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where a table has what: columns (k,) of the values, and of their deviations, -1 where there are none."""
+    """Where a table has what: of each of k parameters the columns of value and deviation, with their factors to SI.
+
+    A deviation that there is not is None.
+    """
 
     frame: int
     indices: NDArray[np.int64]
-    values: Sequence[int]
-    deviations: Sequence[int]
-    factors: Array
+    pairs: Sequence[Sequence[tuple[int, float] | None]]
     model: ReducedModel
 
     @classmethod
@@ -121,9 +122,7 @@ class _Columns:
         return cls(
             list(header).index(FRAME),
             np.array([names.index(name) for name in named], dtype=np.int64),
-            [found[name][False][0] for name in named],
-            [found[name].get(True, (-1, 1.0))[0] for name in named],
-            np.array([[found[name][False][1], found[name].get(True, (-1, 1.0))[1]] for name in named]),
+            [(found[name][False], found[name].get(True)) for name in named],
             model,
         )
 
@@ -132,20 +131,16 @@ class _Columns:
         frame = _number(where, cells, self.frame)
         if not frame.is_integer():
             raise TrackingError(f"{where}: '{cells[self.frame]}' is no number of a frame")
-        values = np.array([[_number(where, cells, k) for k in self.values], self._deviations(where, cells)]).T
-        values *= self.factors
+        values = np.array([[_number(where, cells, *one) if one else np.nan for one in pair] for pair in self.pairs])
         for k, (value, deviation) in zip(self.indices.tolist(), values, strict=True):
             check_known(where, self.model, k, value, deviation)
         return int(frame), with_usual_deviations(self.model, self.indices, values)
 
-    def _deviations(self, where: str, cells: Sequence[str]) -> list[float]:
-        return [np.nan if k < 0 else _number(where, cells, k) for k in self.deviations]
 
-
-def _number(where: str, cells: Sequence[str], column: int) -> float:
-    """A cell's number; NaN where it is empty, but for the frame's."""
+def _number(where: str, cells: Sequence[str], column: int, factor: float = 1.0) -> float:
+    """A cell's number times a factor; NaN where it is empty."""
     try:
-        return float(cells[column] or "nan")
+        return factor * float(cells[column] or "nan")
     except ValueError:
         raise TrackingError(f"{where}: '{cells[column]}' is no number") from None
 
