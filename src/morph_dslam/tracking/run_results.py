@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.sequence_filter import PATIENCE
 
 Array = NDArray[np.float64]
+_Known = TypeVar("_Known")
+#: A largest value and its deviation where there is none.
+_UNKNOWN = (float("nan"), float("nan"))
 #: So many standard deviations of both together, with all that these contain, are a contradiction. The filter begins
 #: anew by what is new in each frame alone; errors of the model that change with the state may be the whole difference.
 APART = 3.0
@@ -106,8 +110,7 @@ class RunResults:
 
     def covariances(self) -> Array:
         """(f, d + 6, d + 6) of parameters, rotation vector and translation, SI, NaN where lost."""
-        lost = np.full((len(self.model.parameters) + 6,) * 2, np.nan)
-        return np.array([lost if r.estimate is None else r.estimate.covariance for r in self.results])
+        return np.array([result.covariance for result in self.results])
 
     def stated_std(self) -> Array:
         """(f, d), SI, of the parameters before the residuals widen them, NaN where lost."""
@@ -197,17 +200,13 @@ class RunResults:
     # What is known of the frames so far is kept, so that a frame costs the same however long the run is.
 
     def _known_displacements(self) -> list[tuple[float, float]]:
-        return self._added_to(self._largest, largest_displacement, self._surface)
+        return self._added_to(self._largest, lambda found: largest_displacement(self._surface, found), _UNKNOWN)
 
     def _known_stresses(self) -> list[tuple[float, float]]:
-        return self._added_to(self._stressed, largest_von_mises, self._stressed_surface)
+        return self._added_to(self._stressed, lambda found: largest_von_mises(self._stressed_surface, found), _UNKNOWN)
 
     def _known_reactions(self) -> list[dict[str, Reaction]]:
-        reactions = self._reactions_of_model
-        for result in self.results[len(self._reactions) :]:
-            found = result.estimate
-            self._reactions.append({} if found is None else reactions(found, self.modulus_std))
-        return self._reactions
+        return self._added_to(self._reactions, lambda found: self._reactions_of_model(found, self.modulus_std), {})
 
     def _known_points(self) -> list[tuple[list[VectorEstimate], list[VectorEstimate]] | None]:
         """Displacements and turns of the named points."""
@@ -235,16 +234,10 @@ class RunResults:
         stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
         return replace(self.model, stresses=stresses)
 
-    def _added_to(
-        self,
-        known: list[tuple[float, float]],
-        largest: Callable[[ReducedModel, Estimate], tuple[float, float]],
-        surface: ReducedModel,
-    ) -> list[tuple[float, float]]:
-        """What is ``known`` of the frames so far (f), added to by what is ``largest`` in those since."""
-        for result in self.results[len(known) :]:
-            found = result.estimate
-            known.append((np.nan, np.nan) if found is None else largest(surface, found))
+    def _added_to(self, known: list[_Known], of: Callable[[Estimate], _Known], lost: _Known) -> list[_Known]:
+        """What is ``known`` of the frames so far (f), added to by that ``of`` those since, ``lost`` without one."""
+        estimates = (result.estimate for result in self.results[len(known) :])
+        known += [lost if found is None else of(found) for found in estimates]
         return known
 
     def timings_ms(self) -> Array:
