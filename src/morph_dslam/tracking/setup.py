@@ -178,34 +178,30 @@ def _load_object(name: str, part: ObjectOptions, run: TrackOptions, scene_of: Ca
             _check_frame(landmarks, number)
     if part.time_zero is not None:
         _check_clock(KnownTime.of(model, part.time_zero), known)
-    options, zero = part.tracker, part.time_zero
+    made = partial(
+        TrackedObject,
+        name,
+        options=part.tracker,
+        inner=inner,
+        reregister_at=again,
+        click_px=run.click_px,
+        points=points,
+        known=known,
+        time_zero=part.time_zero,
+    )
     if part.registration is None:
         start = initializer if part.landmarks is None else load_landmarks(part.landmarks)
         assert start is not None
-        said = {"click_px": run.click_px, "at_rest": part.at_rest, "snap": part.snap, "points": points, "known": known}
-        return TrackedObject(name, model, start, options, inner, reregister_at=again, time_zero=zero, **said)
+        return made(model, start, at_rest=part.at_rest, snap=part.snap)
     registration, path = load_registration(part.registration, model), map_of(part.registration, run.map_path)
-    if path is None and options.pose != "free":
+    if path is None and part.tracker.pose != "free":
         note = "no map was given or found beside the registration: the object is tracked as a free one"
         registration = replace(registration, warnings=(*registration.warnings, Remark(note)))
     if path is not None:
         registration = in_scene(registration, scene_of(path))
     # A free object is not where the map has it, but looks as in the map's keyframes.
-    keyframes = registered_keyframes(registration)
     # Not the model of the file: beside a copy with an open angle it would be kept for nothing.
-    return TrackedObject(
-        name,
-        registration.model,
-        registration,
-        options,
-        inner,
-        keyframes,
-        again,
-        run.click_px,
-        points=points,
-        known=known,
-        time_zero=zero,
-    )
+    return made(registration.model, registration, keyframes=registered_keyframes(registration))
 
 
 def _check_clock(clock: KnownTime, known: KnownValues | None) -> None:
