@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -18,7 +19,6 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket
 
 from morph_dslam.errors import StudioError
 from morph_dslam.io.access import ServerNames
@@ -130,18 +130,6 @@ class _Answers:
             raise HTTPException(404, "a phone brings recordings")
         return await self.upload(request)
 
-    async def camera(self, browser: WebSocket) -> None:
-        """Frames of a camera of this computer."""
-        await self._steps.live.relay.camera(browser, "of this computer")
-
-    async def phone_camera(self, browser: WebSocket) -> None:
-        """Frames of a phone."""
-        await self._steps.live.relay.camera(browser, "of the phone")
-
-    async def watch(self, browser: WebSocket) -> None:
-        """Live pictures for a page."""
-        await self._steps.live.relay.watch(browser)
-
     async def file(self, request: Request) -> Response:
         """A file of the project, to keep."""
         path = self._steps.project.path(request.path_params["name"])
@@ -240,7 +228,7 @@ def phone_app(steps: Steps, access: Access) -> Callable:
     routes = [
         Route("/", answers.phone),
         Route("/api/upload/{kind:str}/{name:path}", answers.phone_upload, methods=["PUT"]),
-        WebSocketRoute("/api/camera", answers.phone_camera),
+        WebSocketRoute("/api/camera", partial(steps.live.relay.camera, what="of the phone")),
         Route("/{name:path}", answers.phone_page),
     ]
     application = Starlette(routes=routes, exception_handlers=_HANDLERS)  # type: ignore[arg-type]
@@ -277,8 +265,8 @@ def make_app(
         Route("/api/upload/{kind}/{name:path}", answers.upload, methods=["PUT"]),
         Route("/api/phone.png", answers.phone_code),
         Route("/api/frame/{number:int}", answers.frame),
-        WebSocketRoute("/api/camera", answers.camera),
-        WebSocketRoute("/api/watch", answers.watch),
+        WebSocketRoute("/api/camera", partial(steps.live.relay.camera, what="of this computer")),
+        WebSocketRoute("/api/watch", steps.live.relay.watch),
         Route("/api/scan/{number:int}", answers.scan_frame),
         Route("/api/{action}", answers.call, methods=["POST"]),
         Route("/files/{name:path}", answers.file),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from morph_dslam.extend.registration import Landmarks, bind_landmarks, load_land
 from morph_dslam.extend.tracking import State
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.packing import packed
-from morph_dslam.studio.project import part_of
+from morph_dslam.studio.project import part_of, read_once, stamp
 from morph_dslam.units import from_si
 
 Array = NDArray[np.float64]
@@ -35,33 +34,16 @@ FEWEST_PAIRS = 4
 GOOD_PX = 3.0
 
 
-def stamp(path: Path) -> tuple[int, int]:
-    """What changes when a file is written again; zeros if there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return 0, 0
-    return found.st_mtime_ns, found.st_size
-
-
-@lru_cache(maxsize=2)  # that of the project, and that of its run
-def _model(path: Path, seal: tuple[int, int]) -> ReducedModel:
+@read_once(2)  # that of the project, and that of its run
+def opened_model(path: Path) -> ReducedModel:
+    """A model file, read once."""
     return load_model(path)
 
 
-@lru_cache(maxsize=2)
-def _camera(path: Path, seal: tuple[int, int]) -> Camera:
-    return load_camera(path)
-
-
-def opened_model(path: Path) -> ReducedModel:
-    """A model file, read once."""
-    return _model(path, stamp(path))
-
-
+@read_once(2)
 def opened_camera(path: Path) -> Camera:
     """A camera file, read once."""
-    return _camera(path, stamp(path))
+    return load_camera(path)
 
 
 def camera_facts(path: Path) -> dict[str, Any]:
@@ -258,33 +240,29 @@ def _overlay(path: Path, camera: Camera, mu: Array, camera_from_object: RigidTra
     )
 
 
-@lru_cache(maxsize=1)
-def _pages(path: Path, seal: tuple[int, int]) -> ModelPages:
-    return ModelPages(_model(path, seal))
+@read_once(1)
+def _pages(path: Path) -> ModelPages:
+    return ModelPages(opened_model(path))
 
 
 def explore_answer(path: Path, target: str) -> tuple[str, bytes] | None:
     """What `morph explore` answers to a path and query (content type, content), None where it has nothing."""
     try:
-        return _pages(path, stamp(path)).answer(target)
+        return _pages(path).answer(target)
     except BadRequest as error:
         raise StudioError(str(error)) from error
 
 
 def _top(path: Path) -> float:
     """The end of the colours, one for the whole box as in `morph explore`."""
-    tops = {field.unit: field.top for field in _pages(path, stamp(path)).surface.fields}
+    tops = {field.unit: field.top for field in _pages(path).surface.fields}
     in_mm = tops.pop("mm")
     return next(iter(tops.values()), in_mm)
 
 
+@read_once(2)
 def landmarks_problem(model_path: Path, path: Path) -> str | None:
     """Why the object of a model cannot be placed by a file of landmarks, as `morph track` says; None if it may be."""
-    return _landmarks_problem(model_path, path, stamp(model_path), stamp(path))
-
-
-@lru_cache(maxsize=2)
-def _landmarks_problem(model_path: Path, path: Path, of_model: tuple[int, int], seal: tuple[int, int]) -> str | None:
     try:
         bind_landmarks(opened_model(model_path), load_landmarks(path).points)
     except RegistrationError as error:

@@ -60,7 +60,7 @@ class LiveSteps:
     async def _wanted_size(self) -> Size | None:
         """The size of images by the camera file; None if there is none that can be read."""
         path = self._project.path(names.CAMERA)
-        now = clicks.stamp(path)
+        now = names.stamp(path)
         if now != self._camera[0]:
             try:
                 facts = await self._worker.call(clicks.camera_facts, path) if now[1] else None
@@ -124,8 +124,8 @@ class LiveSteps:
     async def go_live(self, snap: bool = False, outline: bool = False) -> dict[str, Any]:
         """Start `morph live` with the camera that sends, from the frame with pairs, or from the place in the scan."""
         self._jobs.check_idle()
-        self._need(names.MODEL, "build the model first")
-        self._need(names.CAMERA, "calibrate the camera, or drop its file")
+        self._project.needed(names.MODEL, "build the model first")
+        self._project.needed(names.CAMERA, "calibrate the camera, or drop its file")
         if self.relay.newest is None:
             raise StudioError(self.relay.facts()["refused"] or _NO_CAMERA)
         words = ["live", str(await self.relay.listen()), "--model", names.MODEL, "--camera", names.CAMERA]
@@ -141,13 +141,9 @@ class LiveSteps:
         await self._jobs.start("live", words)
         return {}
 
-    def _need(self, name: str, message: str) -> None:
-        if not self._project.has(name):
-            raise StudioError(f"{name} is not there: {message}")
-
     async def _pairs_words(self, snap: bool) -> list[str]:
         """The options of `morph live` that start from pairs, in their frame."""
-        self._need(names.LANDMARKS, "take a frame, click pairs on it, and save them")
+        self._project.needed(names.LANDMARKS, "take a frame, click pairs on it, and save them")
         flags = {"--at-rest": self._project.choices.get("at_rest", False), "--snap": snap}
         words = ["--landmarks", names.LANDMARKS, *(flag for flag, is_set in flags.items() if is_set)]
         return [*words, "--reference-image", await self._write_reference()]

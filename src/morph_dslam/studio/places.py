@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +17,21 @@ from morph_dslam.errors import StudioError
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.registration import Landmarks, save_landmarks
 from morph_dslam.studio import clicks
-from morph_dslam.studio.clicks import opened_camera, opened_model, stamp
+from morph_dslam.studio.clicks import opened_camera, opened_model
+from morph_dslam.studio.project import read_once
 
 #: Points of the object that stand for another place, spread over it.
 _N_POINTS = 12
 
 
-@lru_cache(maxsize=1)
-def _scene(path: Path, camera: Path, seals: tuple) -> Scene:
+@read_once(1)
+def _scene(path: Path, camera: Path) -> Scene:
     return load_scene(path, opened_camera(camera))
 
 
 def map_keyframes(path: Path, camera: Path) -> list[int]:
     """Frame numbers of a map's keyframes."""
-    return sorted(keyframe.index for keyframe in _opened_scene(path, camera).keyframes)
-
-
-def _opened_scene(path: Path, camera: Path) -> Scene:
-    return _scene(path, camera, (stamp(path), stamp(camera)))
+    return sorted(keyframe.index for keyframe in _scene(path, camera).keyframes)
 
 
 def _registration(model: Path, path: Path) -> Registration:
@@ -86,7 +82,7 @@ def _pose(
         raise StudioError(f"there is no other place {rival}: there are {len(found.rivals)}")
     assert found.map_registration is not None
     in_map = replace(found.map_registration, world_from_object=found.rivals[rival].world_from_object)
-    (view,) = (each for each in _opened_scene(map_path, camera).keyframes if each.index == frame)
+    (view,) = (each for each in _scene(map_path, camera).keyframes if each.index == frame)
     return in_map.pose_in(view.camera_from_world)
 
 

@@ -6,11 +6,12 @@ import hashlib
 import json
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from morph_dslam.errors import StudioError
 
@@ -30,6 +31,7 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+Arguments, Result = ParamSpec("Arguments"), TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,12 @@ class Project:
     def has(self, name: str) -> bool:
         """Whether the project has this file or folder."""
         return self.path(name).exists()
+
+    def needed(self, name: str, advice: str) -> Path:
+        """The path of a file or folder; raises StudioError, with the advice, if it is not there."""
+        if not self.has(name):
+            raise StudioError(f"{name} is not there: {advice}")
+        return self.path(name)
 
     def upload_path(self, kind: str, name: str) -> tuple[Path, UploadKind]:
         """Where an upload goes, and how large it may be.
@@ -275,6 +283,36 @@ class Project:
 def part_of(path: Path) -> Path:
     """Where a file of a project is written until all of it is there: hidden, so it is none of the project's yet."""
     return path.with_name(f".{path.name}.part")
+
+
+def stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file is written again; zeros if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
+
+
+def read_once(most: int) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Keep what a function of paths gives, for so many of them, until a file, or one in a folder, is written again."""
+
+    def keeping(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        @lru_cache(maxsize=most)
+        def kept(seals: tuple, *paths: Any) -> Result:
+            return function(*paths)
+
+        @wraps(function)
+        def read(*paths: Arguments.args, **none: Arguments.kwargs) -> Result:
+            return kept(tuple(map(_seal, paths)), *paths)
+
+        return read
+
+    return keeping
+
+
+def _seal(path: Any) -> tuple:
+    return tuple((file.name, *stamp(file)) for file in sorted(path.iterdir())) if path.is_dir() else stamp(path)
 
 
 def _shown(name: str) -> str:

@@ -6,7 +6,6 @@ These functions run in the worker process.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from PIL import ExifTags, Image
 from morph_dslam import Frame, open_source
 from morph_dslam.errors import StudioError
 from morph_dslam.sources.recorded import RecordedFrames
-from morph_dslam.studio.clicks import stamp
+from morph_dslam.studio.project import read_once
 
 _JPEG_QUALITY = 88
 #: JPEGs that are kept for a page that goes back and forth.
@@ -65,15 +64,9 @@ class _Recording:
         return frame.image
 
 
-@lru_cache(maxsize=2)
-def _recording(path: Path, seal: tuple) -> _Recording:
-    return _Recording(path)
-
-
+@read_once(2)
 def _opened(path: Path) -> _Recording:
-    # Any image of a folder may have been replaced.
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return _recording(path, tuple((file.name, *stamp(file)) for file in files))
+    return _Recording(path)
 
 
 def recording_facts(path: Path) -> dict[str, Any]:

@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Iterable
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 
 from morph_dslam import ReducedModel, load_model
 from morph_dslam.errors import StudioError
-from morph_dslam.studio.clicks import opened_model, overlay, stamp
+from morph_dslam.studio.clicks import opened_model, overlay
+from morph_dslam.studio.project import read_once, stamp
 
 #: What `morph live` calls the frames that the studio hands to it.
 _LIVE_SOCKET = "camera.sock"
@@ -161,15 +161,16 @@ def run_frames(run: Path) -> list[dict[str, Any]] | None:
 
 
 def _frames_of(run: Path) -> dict[int, dict[str, Any]]:
-    return _frames(run, stamp(run / _RESULT), stamp(run / "summary.json"))
+    return _frames(run / _RESULT, run / "summary.json")
 
 
-@lru_cache(maxsize=1)
-def _frames(run: Path, *seals: tuple[int, int]) -> dict[int, dict[str, Any]]:
-    """Frames by number, read once."""
+@read_once(1)
+def _frames(result: Path, summary: Path) -> dict[int, dict[str, Any]]:
+    """Frames by number, of the results that were written with a summary."""
+    run = result.parent
     try:
         names = [parameter.name for parameter in opened_model(run / _MODEL).study_parameters]
-        with h5py.File(run / _RESULT) as file:
+        with h5py.File(result) as file:
             columns = _columns(file, names)
     except (OSError, KeyError, ValueError, RuntimeError) as error:
         raise StudioError(f"the results in {run.name} are damaged or cut short: track again") from error
@@ -234,11 +235,11 @@ def is_of_model(run: Path, model: Path) -> bool:
     own = run / _MODEL
     if not own.is_file() or not model.is_file():
         return True
-    return _are_same(own, stamp(own), model, stamp(model))
+    return _are_same(own, model)
 
 
-@lru_cache(maxsize=4)
-def _are_same(first: Path, first_seal: tuple[int, int], second: Path, second_seal: tuple[int, int]) -> bool:
+@read_once(4)
+def _are_same(first: Path, second: Path) -> bool:
     one, other = load_model(first), opened_model(second)
     if one.nodes.shape != other.nodes.shape or not np.array_equal(one.triangles, other.triangles):
         return False

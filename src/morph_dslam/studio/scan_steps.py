@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -146,11 +147,9 @@ class ScanSteps:
         """A frame of the scan."""
         return await self._worker.call(recording.frame_jpeg, self._project.path(self._source()), number)
 
-    def _model_and_camera(self) -> tuple[Any, Any]:
-        for name, step in ((names.MODEL, "build the model first"), (names.CAMERA, "give the camera first")):
-            if not self._project.has(name):
-                raise StudioError(f"{name} is not there: {step}")
-        return self._project.path(names.MODEL), self._project.path(names.CAMERA)
+    def _model_and_camera(self) -> tuple[Path, Path]:
+        needed = self._project.needed
+        return needed(names.MODEL, "build the model first"), needed(names.CAMERA, "give the camera first")
 
     async def map_scan(self, last: _Frame | None = None) -> dict[str, Any]:
         """Start `morph slam` with the frames up to one; a place in an earlier map is forgotten."""

@@ -313,7 +313,7 @@ class Steps:
     async def build(self) -> dict[str, Any]:
         """Start `morph build`, or go on with one that was stopped."""
         self._jobs.check_idle()
-        self._needed(names.STUDY, "load the object, and describe the study first")
+        self.project.needed(names.STUDY, "load the object, and describe the study first")
         await self._jobs.start("build", ["build", names.STUDY, "-o", names.MODEL])
         return {}
 
@@ -324,18 +324,13 @@ class Steps:
 
     async def model(self) -> dict[str, Any]:
         """What the model is."""
-        return await self._worker.call(clicks.model_facts, self._needed(names.MODEL, "build the model first"))
+        return await self._worker.call(clicks.model_facts, self.project.needed(names.MODEL, "build the model first"))
 
     async def explore(self, target: str) -> tuple[str, bytes] | None:
         """What the explorer answers."""
         return await self._worker.call(
-            clicks.explore_answer, self._needed(names.MODEL, "build the model first"), target
+            clicks.explore_answer, self.project.needed(names.MODEL, "build the model first"), target
         )
-
-    def _needed(self, name: str, message: str) -> Path:
-        if not self.project.has(name):
-            raise StudioError(f"{name} is not there: {message}")
-        return self.project.path(name)
 
     # -- camera ------------------------------------------------------------------------------------
 
@@ -413,7 +408,7 @@ class Steps:
 
     async def model_mesh(self) -> bytes:
         """The undeformed surface of the model."""
-        return await self._worker.call(clicks.model_surface, self._needed(names.MODEL, "build the model first"))
+        return await self._worker.call(clicks.model_surface, self.project.needed(names.MODEL, "build the model first"))
 
     async def fit(self, pairs: Pairs, at_rest: bool, quick: bool = False) -> bytes:
         """The object placed by pairs, with its overlay and the errors; quick ones start from the last fit."""
@@ -423,8 +418,8 @@ class Steps:
 
     def _model_and_camera(self) -> tuple[Path, Path]:
         return (
-            self._needed(names.MODEL, "build the model first"),
-            self._needed(names.CAMERA, "calibrate the camera, or drop its file"),
+            self.project.needed(names.MODEL, "build the model first"),
+            self.project.needed(names.CAMERA, "calibrate the camera, or drop its file"),
         )
 
     async def save_start(
@@ -454,7 +449,7 @@ class Steps:
 
     def _pairs_words(self, refine: bool, snap: bool) -> list[str]:
         """The options of `morph track` that start from pairs."""
-        self._needed(names.LANDMARKS, "click and save pairs first")
+        self.project.needed(names.LANDMARKS, "click and save pairs first")
         chosen, words = self.project.choices, ["--landmarks", names.LANDMARKS]
         if chosen.get("reference_frame") is not None:
             words += ["--reference-frame", str(chosen["reference_frame"])]
@@ -513,7 +508,7 @@ class Steps:
     async def export(self, format: Literal["vtu", "xdmf", "gltf"]) -> dict[str, Any]:
         """Start `morph export` of the tracked states."""
         table = f"{names.RUN}/frames.csv"
-        self._needed(table, "track the video first")
+        self.project.needed(table, "track the video first")
         problem = await self._model_problem()
         if problem is not None:
             raise StudioError(problem)
