@@ -26,19 +26,24 @@ class SynchronizedFrames:
     are a second apart or more, the first frames are of one instant. An instant that the first camera lacks has the
     number after the last one, or is left out if that camera has a frame of this number.
 
+    By their times, recordings are given from their beginnings, and a range is cut here: a camera that lost frames has
+    other numbers, and one that is cut by its own shows other instants.
+
     Parameters
     ----------
     sources : by camera.
+    first, last : range of instants, by numbers of the first camera's frames, both included; open ends by default.
 
     Attributes
     ----------
+    sources : by camera.
     n_instants : number of instants in the last pass so far.
     n_missing : by camera, how many of these it has no frame of.
     n_left_out : how many of these are left out.
     """
 
-    def __init__(self, sources: Sequence[FrameSource]) -> None:
-        self.sources = tuple(sources)
+    def __init__(self, sources: Sequence[FrameSource], first: int | None = None, last: int | None = None) -> None:
+        self.sources, self._first, self._last = tuple(sources), first, last
         self.n_instants, self.n_missing, self.n_left_out = 0, [0] * len(sources), 0
 
     @property
@@ -90,12 +95,30 @@ class SynchronizedFrames:
         return getattr(self.sources[0], "has_registered_depth", False)
 
     def __len__(self) -> int:
-        """Number of instants; there are more where no camera has all."""
-        return max(len(source) for source in self.sources)
+        """Number of instants; there are more where no camera has all, and a range counts from frame 0."""
+        end = None if self._last is None else self._last + 1
+        return len(range(max(len(source) for source in self.sources))[self._first : end])
 
     def __iter__(self) -> Iterator[tuple[Frame, ...]]:
+        self.n_instants, self.n_missing, self.n_left_out = 0, [0] * len(self.sources), 0
+        has_begun = self._first is None
+        for frames, is_left_out in self._instants():
+            number = frames[0].index
+            if self._last is not None and number > self._last:
+                return
+            has_begun = has_begun or (number >= (self._first or 0) and not is_left_out)
+            if not has_begun:
+                continue
+            self.n_instants += 1
+            self.n_left_out += is_left_out
+            for k, frame in enumerate(frames):
+                self.n_missing[k] += isinstance(frame, MissingFrame)
+            if not is_left_out:
+                yield frames
+
+    def _instants(self) -> Iterator[tuple[tuple[Frame, ...], bool]]:
+        """The frames of each instant of the whole recordings, and whether it is to be left out."""
         readers = [iter(source) for source in self.sources]
-        self.n_instants, self.n_missing, self.n_left_out = 0, [0] * len(readers), 0
         come = [frame for reader in readers for frame in islice(reader, 1)]
         if len(come) < len(readers):
             return
@@ -109,18 +132,13 @@ class SynchronizedFrames:
             now = clocks.together(waiting)
             numbers = [frame.index for frame in now if frame is not None]
             number = last + 1 if by_time and now[0] is None else numbers[0]
-            times = clocks.times(now)
-            self.n_instants += 1
-            for k, frame in enumerate(now):
-                self.n_missing[k] += frame is None
-            if now[0] is None and waiting[0] is not None and waiting[0].index <= number:
-                self.n_left_out += 1
-            else:
-                last = number
-                yield tuple(
-                    MissingFrame(number, time, image) if frame is None else replace(frame, index=number)
-                    for frame, time, image in zip(now, times, blank, strict=True)
-                )
+            is_left_out = now[0] is None and waiting[0] is not None and waiting[0].index <= number
+            last = last if is_left_out else number
+            frames = tuple(
+                MissingFrame(number, time, image) if frame is None else replace(frame, index=number)
+                for frame, time, image in zip(now, clocks.times(now), blank, strict=True)
+            )
+            yield frames, is_left_out
             waiting = [
                 old if new is None else next(reader, None)
                 for old, new, reader in zip(waiting, now, readers, strict=True)

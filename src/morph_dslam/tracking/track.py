@@ -162,19 +162,30 @@ def _with_first_frame(run: TrackOptions, objects: Sequence[TrackedObject]) -> Tr
 
 def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
     """The frames to track, and what gives reference frames."""
-    recordings = [(run.frames, run.depth_per_metre), *((path, None) for path in run.other_cameras)]
+    whole = _whole_recordings(run) if run.other_cameras else None
 
     @cache
     def frames_at(number: int | None) -> tuple[Frame, ...]:
         wanted = run.first if number is None else number
-        if run.other_cameras:
-            every = SynchronizedFrames([open_source(path, None, None, run.fps, scale) for path, scale in recordings])
-            if every.goes_by_time:
-                return every.at(wanted)
-        return tuple(frame_at(path, wanted, scale) for path, scale in recordings)
+        if whole is not None and whole.goes_by_time:
+            return whole.at(wanted)
+        return tuple(frame_at(path, wanted, scale) for path, scale in _recordings(run))
 
-    sources = [open_source(path, run.first, run.last, run.fps, scale) for path, scale in recordings]
-    return (SynchronizedFrames(sources) if run.other_cameras else sources[0]), frames_at
+    if whole is None or not whole.goes_by_time:
+        sources = [open_source(path, run.first, run.last, run.fps, scale) for path, scale in _recordings(run)]
+        return (SynchronizedFrames(sources) if run.other_cameras else sources[0]), frames_at
+    open_source(run.frames, run.first, run.last, run.fps, run.depth_per_metre)  # refused where the range is not in it
+    return SynchronizedFrames(whole.sources, run.first, run.last), frames_at
+
+
+def _recordings(run: TrackOptions) -> list[tuple[Path | str, float | None]]:
+    """By camera, the recording, and how many values a metre its depth images have."""
+    return [(run.frames, run.depth_per_metre), *((path, None) for path in run.other_cameras)]
+
+
+def _whole_recordings(run: TrackOptions) -> SynchronizedFrames:
+    """What all cameras recorded, from the beginnings: where frames go by times, these tell whose clocks are one."""
+    return SynchronizedFrames([open_source(path, None, None, run.fps, scale) for path, scale in _recordings(run)])
 
 
 def _open_live(run: TrackOptions, stack: ExitStack) -> tuple[Source, FramesAt]:
