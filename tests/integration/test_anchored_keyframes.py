@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from morph_dslam.cli.app import main
 from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.model import load_model
@@ -163,5 +164,5 @@ def test_a_camera_has_those_pictures_of_the_scan_that_it_filmed(rig_recording):
     keyframes = sorted(placed.object.keyframes)
     filmed = [number for number in keyframes if number >= FIRST_BESIDE]
     assert 1 < len(filmed) < len(keyframes)
-    assert sorted(images_from(folder / "aside", RIG[1].camera, keyframes)) == filmed
+    assert sorted(images_from(md.open_source(folder / "aside"), RIG[1].camera, keyframes)) == filmed
     assert {view.frame for view in placed.keyframes[1].views} <= set(filmed)

@@ -11,6 +11,7 @@ from morph_dslam.io.camera_files import save_rig
 from morph_dslam.model import save_model
 from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import MissingFrame
+from morph_dslam.tracking.placement import images_from
 from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.track import prepare
 from tests.support.bent_sheet import bent_sheet_model
@@ -106,3 +107,30 @@ def test_a_run_in_a_range_tracks_what_both_cameras_saw_at_one_time(films_by_time
 def test_a_range_that_the_first_camera_has_not_is_refused(films_by_time):
     with ExitStack() as stack, pytest.raises(md.MorphError, match="frame 80 is not in"):
         prepare(options(films_by_time, 60, 80), stack)
+
+
+def test_pictures_of_a_keyframe_are_of_its_instant():
+    """A strip of texture moves by five pixels an instant before both cameras."""
+    noise = np.random.default_rng(0).integers(0, 255, (24, 5 * N + 32), dtype=np.uint8)
+    strip = np.repeat(cv2.GaussianBlur(noise, (0, 0), 2.0)[:, :, None], 3, axis=2)
+
+    def filmed(instants):
+        return Timed(Frame(k, EPOCH + n / RATE, strip[:, 5 * n : 5 * n + 32]) for k, n in enumerate(instants))
+
+    camera = md.Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+    recordings = SynchronizedFrames([filmed(range(N)), filmed(without(10, 5))])
+    seen = images_from(recordings.of_camera(1), camera, [5, 12, 40, 60])
+    assert sorted(seen) == [5, 40, 60]  # frame 12 was lost
+    for number, image in seen.items():
+        np.testing.assert_array_equal(image.grey, strip[:, 5 * number : 5 * number + 32, 0])
+
+
+def test_numbered_pictures_of_a_keyframe_are_those_of_its_number():
+    """Where numbers tell, a recording may begin within the scan."""
+
+    class Numbered(Timed):
+        has_assumed_times = True
+
+    image = np.zeros((4, 6, 3), dtype=np.uint8)
+    recordings = [Numbered(Frame(k, k / RATE, image) for k in range(first, 9)) for first in (0, 4)]
+    assert [frame.index for frame in SynchronizedFrames(recordings).of_camera(1)] == [4, 5, 6, 7, 8]

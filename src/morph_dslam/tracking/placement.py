@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +30,7 @@ from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.setup import TrackedObject
+from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.tracker_inputs import widened
 from morph_dslam.tracking.views import KeyframeViews, choose_keyframe_views, image_of, registered_images
@@ -271,18 +272,20 @@ def place_by_map(part: TrackedObject, camera: Camera, frame: Frame) -> TrackedOb
     )
 
 
-def with_other_images(placed: Sequence[PlacedObject], recordings: Sequence[Path]) -> list[PlacedObject]:
+def with_other_images(placed: Sequence[PlacedObject], recorded: SynchronizedFrames | None) -> list[PlacedObject]:
     """The objects with what else shows them undeformed, without what others occlude of them there.
 
     Parameters
     ----------
     placed : all objects of the run.
-    recordings : of the cameras beside the first, whose frames of the scan are used as well.
+    recorded : what all cameras of a rig recorded, whose frames of the scan are used as well; None of one camera.
     """
-    return [_with_other_images(own, [other for other in placed if other is not own], recordings) for own in placed]
+    return [_with_other_images(own, [other for other in placed if other is not own], recorded) for own in placed]
 
 
-def _with_other_images(own: PlacedObject, others: Sequence[PlacedObject], recordings: Sequence[Path]) -> PlacedObject:
+def _with_other_images(
+    own: PlacedObject, others: Sequence[PlacedObject], recorded: SynchronizedFrames | None
+) -> PlacedObject:
     seen = tuple(seen_part(own, others, part, own.frame) for part in own.cameras)
     own = replace(own, seen=seen)
     keyframes = own.object.keyframes
@@ -290,8 +293,10 @@ def _with_other_images(own: PlacedObject, others: Sequence[PlacedObject], record
     if not own.is_by_keyframe or len(images) < 2 or not own.options.further_views:
         return own
     found = [_keyframe_views(own, others, own.cameras[0], images)]
-    for part, path in zip(own.cameras[1:], recordings, strict=True):
-        found.append(_keyframe_views(own, others, part, images_from(path, part.camera, list(images))))
+    if recorded is not None:
+        for number, part in enumerate(own.cameras[1:], start=1):
+            seen_then = images_from(recorded.of_camera(number), part.camera, list(images))
+            found.append(_keyframe_views(own, others, part, seen_then))
     return replace(own, keyframes=tuple(found))
 
 
@@ -307,10 +312,10 @@ def _keyframe_views(
     return choose_keyframe_views(Estimator(own.model, part.camera), first, rest, own.options)
 
 
-def images_from(path: Path | str, camera: Camera, numbers: Sequence[int]) -> dict[int, Image]:
-    """Frames of a recording by number, made ready; those that it does not hold are left out."""
+def images_from(frames: Iterable[Frame], camera: Camera, numbers: Sequence[int]) -> dict[int, Image]:
+    """Frames of a camera by number, made ready; those that are not there are left out."""
     maker, images = FrameImages(camera), {}
-    for frame in open_source(path):
+    for frame in frames:
         if frame.index in numbers:
             view = maker.prepare(frame.image, frame.index, frame.timestamp)
             images[frame.index] = Image(view.grey, view.normalized)

@@ -116,6 +116,15 @@ class SynchronizedFrames:
             if not is_left_out:
                 yield frames
 
+    def of_camera(self, camera: int) -> Iterator[Frame]:
+        """What one camera recorded, in the whole recording, with the numbers of the instants."""
+        if not self.goes_by_time:
+            yield from self.sources[camera]
+            return
+        for frames, is_left_out in self._instants():
+            if not is_left_out and not isinstance(frames[camera], MissingFrame):
+                yield frames[camera]
+
     def _instants(self) -> Iterator[tuple[tuple[Frame, ...], bool]]:
         """The frames of each instant of the whole recordings, and whether it is to be left out."""
         readers = [iter(source) for source in self.sources]

@@ -146,7 +146,7 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
     check_depth(run, objects, source)
     check_times(run, source)
     placed = [place(part, cameras, frames_at, run) for part in objects]
-    return run, source, with_other_images(placed, run.other_cameras)
+    return run, source, with_other_images(placed, _whole_recordings(run) if run.other_cameras else None)
 
 
 def _with_first_frame(run: TrackOptions, objects: Sequence[TrackedObject]) -> TrackOptions:
