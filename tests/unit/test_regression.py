@@ -125,6 +125,21 @@ def test_between_few_levels_no_polynomial_is_taken_that_they_do_not_determine(le
     assert (fit.multi_indices.max(axis=0) < levels).all()
 
 
+@pytest.mark.parametrize("scatter", [1e-8, 1e-4, 4e-3])
+def test_levels_that_scatter_determine_no_higher_degree(scatter: float) -> None:
+    """Parabolas through 0, 1/2 and 1 err by |f'''| / (72 sqrt(3)): 0.013 along the two curved parameters together."""
+    x = grid(3, 3, 3, 3)
+    x = np.clip(x + scatter * np.random.default_rng(0).uniform(-1.0, 1.0, x.shape), 0.0, 1.0)
+
+    def function(mu: np.ndarray) -> np.ndarray:
+        return (np.exp(0.5 * mu[:, :1]) * np.cos(mu[:, 1:2]) + mu[:, 2:3] * mu[:, 3:]) + 0.3 * mu[:, :1] ** 2
+
+    lower, upper = x.min(axis=0), x.max(axis=0)
+    fit, _ = fit_functions(x, function(x), None, lower, upper, 8, np.arange(len(x)), raise_single=True)
+    new = lower + np.random.default_rng(1).random((200, 4)) * (upper - lower)
+    assert np.array([fit.evaluate(mu)[0] for mu in new]) == pytest.approx(function(new), abs=0.02)
+
+
 @pytest.mark.parametrize("levels", [(2, 9), (3, 9)])
 def test_slopes_at_levels_determine_twice_the_degree(levels: tuple[int, int]) -> None:
     """exp(0.8 x) sin(5 y): along x, cubics through values and slopes at both ends err by 0.8^4 e^0.8 / 384 at most."""

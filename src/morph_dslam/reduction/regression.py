@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 RIDGE = 1e-8
 #: Parts that the samples are split into for cross-validation.
 FOLDS = 5
+#: Samples belong to one level of a parameter within this part of its range.
+SAME_LEVEL = 0.01
 #: A parameter gets a higher degree than the others if the error falls below this part of what it was.
 WORTH_RAISING = 0.9
 #: Most terms that raised degrees may lead to: the time of a fit grows with their square.
@@ -69,14 +71,20 @@ class _Trial:
     right: Array
 
 
-def _determined(samples: Array, lower: Array, upper: Array, conditions: int) -> NDArray[np.int64]:
-    """The number of degrees (d,), zero included, that samples (n, d) determine along each parameter.
+def _levels(samples: Array, lower: Array, upper: Array) -> NDArray[np.int64]:
+    """The number of levels (d,) that samples (n, d) have along each parameter, those within `SAME_LEVEL` counted once.
 
-    A polynomial of one variable has as many coefficients as it has ``conditions`` at all levels together: 1 each, 2
-    where slopes are known. One of a higher degree may be zero at all of them.
+    Levels of a table scatter, as its values were rounded, measured or reached in steps. Values so close tell no more of
+    a polynomial than its slope there, and this the less, the closer they are.
     """
-    unit = np.round((samples - lower) / (upper - lower), 9)
-    return conditions * np.array([len(np.unique(levels)) for levels in unit.T])
+    counts = []
+    for places in np.sort((samples - lower) / (upper - lower), axis=0).T:
+        count, first = 0, -np.inf
+        for place in places.tolist():
+            if place > first + SAME_LEVEL:
+                count, first = count + 1, place
+        counts.append(count)
+    return np.array(counts, dtype=np.int64)
 
 
 class _Regression:
@@ -98,8 +106,10 @@ class _Regression:
         of_kinds = np.where(np.arange(len(targets)) == 0, 1.0, gradient_weight)
         self._weights = np.multiply.outer(of_kinds, weights[order])[:, :, None]
         self._targets = targets[:, order] * self._weights
+        self._conditions = 1 if len(targets) == 1 else 2
+        self._levels = _levels(samples, box[0], box[1])
         #: Each parameter's degree must be below its number (d,) here.
-        self.degrees = _determined(samples, box[0], box[1], 1 if len(targets) == 1 else 2)
+        self.degrees = self._conditions * self._levels
 
     def total_degree(self, degree: int) -> NDArray[np.int64]:
         """The multi-indices (n_terms, d) of a total degree that the samples determine."""
