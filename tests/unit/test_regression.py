@@ -154,6 +154,26 @@ def test_slopes_at_levels_determine_twice_the_degree(levels: tuple[int, int]) ->
     assert np.array([fit.evaluate(mu)[0] for mu in new]) == pytest.approx(function(new), abs=5e-3)
 
 
+@pytest.mark.parametrize(("levels", "allowed"), [((3, 3, 3, 3), 1e-3), ((2, 2, 2, 2, 2, 2), 0.2)])
+def test_products_that_vanish_with_their_slopes_at_all_samples_are_not_taken(
+    levels: tuple[int, ...], allowed: float
+) -> None:
+    """(x - x^2) (y - y^2) is zero at the corners with its slopes, though of degree 2 in each; so it is of more levels.
+
+    Hermite polynomials along each parameter err by 4e-5 with three levels, and by 1.5^4 / 384 with two.
+    """
+    x, new = grid(*levels), np.random.default_rng(1).random((200, len(levels)))
+    direction = 1.5 * np.arange(1, len(levels) + 1) / len(levels)
+
+    def function(mu: np.ndarray) -> np.ndarray:
+        return 1.0 + np.sin(mu @ direction)[:, None]
+
+    slopes = np.cos(x @ direction)[:, None, None] * direction[:, None]
+    lower, upper = np.zeros(len(levels)), np.ones(len(levels))
+    fit, _ = fit_functions(x, function(x), slopes, lower, upper, 8, np.arange(len(x)), raise_single=True)
+    assert np.array([fit.evaluate(mu)[0] for mu in new]) == pytest.approx(function(new), abs=allowed)
+
+
 def test_a_plane_is_the_fit_of_degree_one() -> None:
     x = samples(40, 6)
     plane = 1.0 + x @ np.array([2.0, -1.0, 0.1])

@@ -120,7 +120,13 @@ class _Regression:
         return self._known(weighted_degree_indices(degrees))
 
     def _known(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-        return indices[(indices < self.degrees).all(axis=1)]
+        """Those (m, d) of multi-indices (n_terms, d) that a full grid of the samples' levels determines.
+
+        Let w_k be the polynomial that is zero at the n_k levels of parameter k. Polynomials that are zero at the grid
+        form the ideal of all w_k, those whose slopes are zero too its square, with w_i w_j. A term is determined unless
+        it is a multiple of the leading term of such a polynomial.
+        """
+        return indices[(indices // self._levels).sum(axis=1) < self._conditions]
 
     def suits(self, indices: NDArray[np.int64]) -> bool:
         """Whether there are enough samples for so many terms when a fold is left out."""
