@@ -171,6 +171,23 @@ def test_a_map_that_is_made_while_its_scan_is_replaced_is_forgotten(tmp_path):
     assert not summary.exists()
 
 
+def test_a_place_can_be_looked_for_as_often_as_one_likes(tmp_path):
+    """`morph register` refuses a folder that holds a registration or its picture."""
+    folder = tmp_path / "place"
+    for name in ("model.morph", "camera.yaml", "map/map.h5", "place/registration.json", "place/registration.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    found = []
+
+    class Waiting(Jobs):
+        async def start(self, kind, words, then=lambda: None):
+            found.append((kind, words[-2:], list(folder.iterdir())))
+
+    scan = ScanSteps(Project(tmp_path), Worker(), Waiting(tmp_path, lambda: None))
+    asyncio.run(scan.find_place())
+    assert found == [("register", ["-o", "place"], [])]
+
+
 async def until_it_ended(jobs):
     """Wait until a command has ended, and all that belongs to its end is done."""
     while jobs.job.running:

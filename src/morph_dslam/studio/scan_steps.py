@@ -18,7 +18,8 @@ from morph_dslam.studio.project import Project
 from morph_dslam.studio.worker import Worker
 
 #: What `morph slam` and `morph register` write, and the pairs that hint at a place.
-_MAP, _MAP_SUMMARY, _PLACE = "map/map.h5", "map/summary.json", "place/registration.json"
+_MAP, _MAP_SUMMARY = "map/map.h5", "map/summary.json"
+_PLACE, _PLACE_PICTURE = "place/registration.json", "place/registration.jpg"
 _HINTS = "scan_landmarks.csv"
 _Pixel = Annotated[float, Field(ge=-1e5, le=1e5)]
 _Frame = Annotated[int, Field(ge=0, le=10**9)]
@@ -182,7 +183,8 @@ class ScanSteps:
         self._project.choose(mapped=None)
 
     def _forget_place(self) -> None:
-        self._project.path(_PLACE).unlink(missing_ok=True)
+        for name in (_PLACE, _PLACE_PICTURE):
+            self._project.path(name).unlink(missing_ok=True)
         self._project.choose(place=None)
 
     async def find_place(
