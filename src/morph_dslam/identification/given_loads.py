@@ -142,48 +142,39 @@ def _sizes(study: Mapping[str, Any], parameters: Sequence[Parameter]) -> Iterato
         for number, section in enumerate(study.get(f"{kind}s") or (), start=1):
             what = section.get("kind") or kind
             where = frozenset(names) & set(_words(section, SECTIONS["loads"]))
-            load = _Load(f"{kind} {number}" + (f" ({what})" if what != kind else ""), where, what not in MOVING, names)
+            load = _Size(f"{kind} {number}" + (f" ({what})" if what != kind else ""), where, None, what not in MOVING)
             if what == "gravity":
                 along = section.get("acceleration") or list(GravityLoad.model_fields["acceleration"].default)
-                yield from (load.weight(a, d) for a in read(along) for d in densities if _acts(a))
+                yield from (_weight(load, a, d, names) for a in read(along) for d in densities if _acts(a))
             else:
                 sizes = [size for key in SIZES if section.get(key) is not None for size in read(section[key])]
-                yield from (load.size(size) for size in sizes if _acts(size))
+                yield from (_component(load, size, names) for size in sizes if _acts(size))
 
 
 def _acts(size: Affine) -> bool:
     return bool(size.constant or size.used)
 
 
-@dataclass(frozen=True)
-class _Load:
-    """A section of the study.
+def _component(load: _Size, size: Affine, names: Sequence[str]) -> _Size:
+    """One component of a load; a function of time alone is proportional to no parameter.
 
-    Attributes
+    Parameters
     ----------
-    name : for people.
-    where : names of the parameters that say where it acts.
-    is_steady : whether it keeps its force while the body moves.
+    load : used are the parameters that say where it acts.
+    size : of the component.
     names : of all parameters.
     """
+    indices = {k for k, slope in enumerate(size.slopes) if slope} | {product.index for product in size.products}
+    by = frozenset(names[k] for k in indices if k is not None)
+    used = load.used | {names[k] for k in size.used}
+    return replace(load, used=used, by=None if size.constant or None in indices else by)
 
-    name: str
-    where: frozenset[str]
-    is_steady: bool
-    names: Sequence[str]
 
-    def size(self, size: Affine) -> _Size:
-        """Of one component; a function of time alone is proportional to no parameter."""
-        indices = {k for k, slope in enumerate(size.slopes) if slope} | {product.index for product in size.products}
-        by = frozenset(self.names[k] for k in indices if k is not None)
-        used = self.where | {self.names[k] for k in size.used}
-        return _Size(self.name, used, None if size.constant or None in indices else by, self.is_steady)
-
-    def weight(self, acceleration: Affine, density: Affine) -> _Size:
-        """Of a product, proportional to the parameters of one factor where the other one is fixed."""
-        a, d = self.size(acceleration), self.size(density)
-        by = d.by if acceleration.fixed else a.by if density.fixed else None
-        return replace(a, used=a.used | d.used, by=by)
+def _weight(load: _Size, acceleration: Affine, density: Affine, names: Sequence[str]) -> _Size:
+    """A load by a product, proportional to the parameters of one factor where the other one is fixed."""
+    a, d = (_component(load, factor, names) for factor in (acceleration, density))
+    by = d.by if acceleration.fixed else a.by if density.fixed else None
+    return replace(a, used=a.used | d.used, by=by)
 
 
 def _densities(content: Any) -> Iterator[Any]:
