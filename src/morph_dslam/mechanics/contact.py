@@ -83,12 +83,12 @@ class RigidPlane:
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
-        unit, point = _unit(self.normal), vector_values(symbols, self.point)
+        unit, point = _unit(self.normal), symbols.values(self.point)
         return Touch((points - point) @ unit, np.tile(unit, (len(points), 1)), np.zeros((len(points), 3, 3)))
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return vector_slopes(symbols, self.point), np.zeros(len(symbols))
+        return symbols.vector_slopes(self.point), np.zeros(len(symbols))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +114,12 @@ class RigidSphere:
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
-        arms = points - vector_values(symbols, self.centre)
+        arms = points - symbols.values(self.centre)
         return _around(arms, np.eye(3), symbols.value(self.radius), self.inside)
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return vector_slopes(symbols, self.centre), _sign(self.inside) * -symbols.slopes(self.radius)
+        return symbols.vector_slopes(self.centre), _sign(self.inside) * -symbols.slopes(self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +149,12 @@ class RigidCylinder:
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`."""
         across = np.eye(3) - np.outer(_unit(self.axis), _unit(self.axis))
-        arms = (points - vector_values(symbols, self.point)) @ across
+        arms = (points - symbols.values(self.point)) @ across
         return _around(arms, across, symbols.value(self.radius), self.inside)
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return vector_slopes(symbols, self.point), _sign(self.inside) * -symbols.slopes(self.radius)
+        return symbols.vector_slopes(self.point), _sign(self.inside) * -symbols.slopes(self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,16 +192,6 @@ def _check_radius(radius: Scalar) -> None:
 
 def _unit(direction: tuple[float, float, float]) -> Array:
     return np.array(direction, dtype=float) / np.linalg.norm(direction)
-
-
-def vector_values(symbols: ParameterSymbols, vector: Vector) -> Array:
-    """(3,) at the present parameters."""
-    return np.array([symbols.value(value) for value in vector])
-
-
-def vector_slopes(symbols: ParameterSymbols, vector: Vector) -> Array:
-    """(d, 3) derivatives by the parameters."""
-    return np.column_stack([symbols.slopes(value) for value in vector])
 
 
 def _sign(inside: bool) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.mechanics.contact import RigidCylinder, RigidObstacle, RigidPlane, RigidSphere, vector_values
+from morph_dslam.mechanics.contact import RigidCylinder, RigidObstacle, RigidPlane, RigidSphere
 from morph_dslam.mechanics.contact_surface import ContactSurface
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.rigid_mesh import RigidMesh
@@ -52,9 +52,9 @@ def core(obstacle: RigidObstacle, symbols: ParameterSymbols, corners: Array) -> 
     none.
     """
     if isinstance(obstacle, RigidMesh):
-        return obstacle.core + vector_values(symbols, obstacle.place)
+        return obstacle.core + symbols.values(obstacle.place)
     if isinstance(obstacle, RigidSphere) and not obstacle.inside:
-        return vector_values(symbols, obstacle.centre)[None]
+        return symbols.values(obstacle.centre)[None]
     if isinstance(obstacle, RigidCylinder) and not obstacle.inside:
         return _axis_within(obstacle, symbols, corners)
     return np.zeros((0, 3))
@@ -62,7 +62,7 @@ def core(obstacle: RigidObstacle, symbols: ParameterSymbols, corners: Array) -> 
 
 def _axis_within(obstacle: RigidCylinder, symbols: ParameterSymbols, corners: Array) -> Array:
     """Points of the axis in a box, about a radius apart."""
-    point, axis = vector_values(symbols, obstacle.point), np.array(obstacle.axis) / np.linalg.norm(obstacle.axis)
+    point, axis = symbols.values(obstacle.point), np.array(obstacle.axis) / np.linalg.norm(obstacle.axis)
     crossed = np.abs(axis) > 1e-12
     beside = ~crossed & ((point < corners[0]) | (point > corners[1]))
     ends = np.sort((corners[:, crossed] - point[crossed]) / axis[crossed], axis=0)
@@ -150,7 +150,7 @@ def travel_in_depths(obstacle: RigidObstacle, symbols: ParameterSymbols, begin: 
 def _depth(obstacle: RigidObstacle, symbols: ParameterSymbols) -> float:
     """Of the core below the obstacle's surface, m; 0 without a core."""
     if isinstance(obstacle, RigidMesh):
-        middle = obstacle.core + vector_values(symbols, obstacle.place)
+        middle = obstacle.core + symbols.values(obstacle.place)
         return float(-obstacle.touch(symbols, middle).gap.min(initial=0.0))
     if isinstance(obstacle, (RigidSphere, RigidCylinder)) and not obstacle.inside:
         return symbols.value(obstacle.radius)
@@ -162,7 +162,7 @@ def _reference(obstacle: RigidObstacle, symbols: ParameterSymbols) -> Array:
     place = obstacle.place if isinstance(obstacle, RigidMesh) else None
     place = obstacle.centre if isinstance(obstacle, RigidSphere) else place
     place = obstacle.point if isinstance(obstacle, (RigidCylinder, RigidPlane)) else place
-    return np.zeros(3) if place is None else vector_values(symbols, place)
+    return np.zeros(3) if place is None else symbols.values(place)
 
 
 def _spread(surface: ContactSurface, spacing: float) -> tuple[NDArray[np.int64], Array]:

@@ -171,13 +171,6 @@ class CoupledSet:
                 "a rigid body needs three that are not"
             )
 
-    def _value(self, vector: Vector) -> Array:
-        return np.array([self._symbols.value(entry) for entry in vector])
-
-    def _slopes(self, vector: Vector) -> Array:
-        """(d, 3) derivatives by the parameters."""
-        return np.column_stack([self._symbols.slopes(entry) for entry in vector])
-
     def _arms(self) -> Array:
         """Coefficients (n, 3) of X - P, undeformed."""
         return self._shape.coordinates(self._symbols)[self.dofs] - np.outer(self._constant, self.point())
@@ -206,19 +199,22 @@ class CoupledSet:
 
     def remote(self, motion: Array) -> Array:
         """(6,) work of the remote load per motion."""
-        force, moment = self._value(self.coupling.force), self._value(self.coupling.moment)
+        force, moment = self._symbols.values(self.coupling.force), self._symbols.values(self.coupling.moment)
         return np.concatenate([force, Rotation.of(motion[3:]).spins @ moment])
 
     def unbalanced_slopes(self, motion: Array, forces: Array) -> Array:
         """(d, 6) derivatives of G' f - remote load by the parameters at fixed motion and ``forces`` f (3 n,)."""
         rotation, by_component = Rotation.of(motion[3:]), forces.reshape(3, -1)
-        force, moment = self._slopes(self.coupling.force), self._slopes(self.coupling.moment)
+        force, moment = (
+            self._symbols.vector_slopes(self.coupling.force),
+            self._symbols.vector_slopes(self.coupling.moment),
+        )
         turned = np.einsum("ick,dnk,cn->di", rotation.slopes, self._arm_slopes(), by_component)
         return np.concatenate([-force, turned - moment @ rotation.spins.T], axis=1)
 
     def stiffness(self, motion: Array, forces: Array) -> Array:
         """(6, 6) derivatives of G' f - remote load, row by row, by the motion at fixed ``forces`` f (3 n,)."""
-        rotation, moment = Rotation.of(motion[3:]), self._value(self.coupling.moment)
+        rotation, moment = Rotation.of(motion[3:]), self._symbols.values(self.coupling.moment)
         result = np.zeros((MOTIONS, MOTIONS))
         result[3:, 3:] = np.einsum("ijck,ck->ij", rotation.curvatures, forces.reshape(3, -1) @ self._arms())
         result[3:, 3:] -= rotation.spin_slopes @ moment
@@ -227,7 +223,7 @@ class CoupledSet:
     @property
     def has_energy(self) -> bool:
         """Whether the remote load has one: a moment has none, save about a hinge."""
-        return int(np.count_nonzero(~self.held[3:])) < 2 or not self._value(self.coupling.moment).any()
+        return int(np.count_nonzero(~self.held[3:])) < 2 or not self._symbols.values(self.coupling.moment).any()
 
     def held_modes(self, modes: Array) -> Array:
         """What is held (k, 6) of rigid ``modes`` (3, n_scalar, 6) of the body."""
@@ -239,12 +235,12 @@ class CoupledSet:
     def point(self) -> Array:
         """Reference point (3,)."""
         point = self.coupling.point
-        return self._constraints.centroid(self.coupling.on)[0] if point is None else self._value(point)
+        return self._constraints.centroid(self.coupling.on)[0] if point is None else self._symbols.values(point)
 
     def point_slopes(self) -> Array:
         """(d, 3) derivatives of the reference point by the parameters."""
         point = self.coupling.point
-        return self._constraints.centroid(self.coupling.on)[1] if point is None else self._slopes(point)
+        return self._constraints.centroid(self.coupling.on)[1] if point is None else self._symbols.vector_slopes(point)
 
     def reaction(self, motion: Array, work: Array) -> tuple[Array, Array]:
         """Force (3,), and moment (3,) about the point, whose ``work`` (6,) per motion is given."""

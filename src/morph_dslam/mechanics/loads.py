@@ -243,14 +243,14 @@ class NodalForces:
         """(3 n_scalar,) forces at the present parameters, N."""
         forces = np.zeros((3, self._n_scalar))
         for load, share in zip(self._loads, self._shares, strict=True):
-            forces += np.outer([self._symbols.value(f) for f in load.force], share)
+            forces += np.outer(self._symbols.values(load.force), share)
         return forces.ravel()
 
     def slopes(self) -> Array:
         """(d, 3 n_scalar) derivatives of `values` by the parameters."""
         slopes = np.zeros((len(self._symbols), 3, self._n_scalar))
         for load, share in zip(self._loads, self._shares, strict=True):
-            slopes += np.column_stack([self._symbols.slopes(f) for f in load.force])[:, :, None] * share
+            slopes += self._symbols.vector_slopes(load.force)[:, :, None] * share
         return slopes.reshape(len(self._symbols), 3 * self._n_scalar)
 
 

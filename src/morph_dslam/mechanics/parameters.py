@@ -111,6 +111,14 @@ class ParameterSymbols:
             result[index] = evaluate(derivative)
         return result
 
+    def values(self, vector: Sequence[Scalar]) -> Array:
+        """Values (k,) of the entries of a vector, as `value`."""
+        return np.array([self.value(entry) for entry in vector])
+
+    def vector_slopes(self, vector: Sequence[Scalar]) -> Array:
+        """Derivatives (d, k) of the entries of a vector, as `slopes`."""
+        return np.column_stack([self.slopes(entry) for entry in vector])
+
     def derivatives(self, expression: Any) -> dict[int, Any]:
         """Derivatives of an expression, as expressions, by the index of each parameter it depends on."""
         if isinstance(expression, (int, float)):

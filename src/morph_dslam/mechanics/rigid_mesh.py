@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 from scipy.spatial import KDTree
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.contact import Touch, Vector, vector_slopes, vector_values
+from morph_dslam.mechanics.contact import Touch, Vector
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.meshing.surface_repair import refined_surface
 from morph_dslam.model.reduced_model import triangle_normals
@@ -145,7 +145,7 @@ class RigidMesh:
 
     def touch(self, symbols: ParameterSymbols, points: Array) -> Touch:
         """See `RigidObstacle`; far away the gap is only known to be positive, and outside there are no derivatives."""
-        points = points - vector_values(symbols, self.place)
+        points = points - symbols.values(self.place)
         low, high = self.points.min(axis=0) - self._step, self.points.max(axis=0) + self._step
         near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
         gap = np.full(len(points), self._step)
@@ -160,7 +160,7 @@ class RigidMesh:
 
     def slopes(self, symbols: ParameterSymbols) -> tuple[Array, Array]:
         """See `RigidObstacle`."""
-        return vector_slopes(symbols, self.place), np.zeros(len(symbols))
+        return symbols.vector_slopes(self.place), np.zeros(len(symbols))
 
 
 def _gradient(distance: NdBSpline, points: Array) -> Array:

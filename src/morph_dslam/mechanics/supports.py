@@ -298,9 +298,9 @@ class PrescribedDisplacement:
         d = len(symbols)
         return AffineMotion(
             matrix=np.zeros((3, 3)),
-            shift=np.array([symbols.value(value) for value in values]),
+            shift=symbols.values(values),
             matrix_slopes=np.zeros((d, 3, 3)),
-            shift_slopes=np.column_stack([symbols.slopes(value) for value in values]),
+            shift_slopes=symbols.vector_slopes(values),
         )
 
 
@@ -368,8 +368,8 @@ class RigidRotation:
 
     def part(self, symbols: ParameterSymbols, share: float) -> RigidRotation:
         """The motion by that share of the angle and of the translation at the present parameters."""
-        translation = tuple(share * symbols.value(value) for value in self.translation)
-        return replace(self, angle=share * symbols.value(self.angle), translation=translation)
+        translation = share * symbols.values(self.translation)
+        return replace(self, angle=share * symbols.value(self.angle), translation=tuple(translation.tolist()))
 
     def motion(self, symbols: ParameterSymbols, centroid: Array, centroid_slopes: Array) -> AffineMotion:
         x, y, z = np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)
@@ -379,10 +379,8 @@ class RigidRotation:
         per_angle = np.cos(angle) * cross + np.sin(angle) * cross @ cross
         matrix_slopes = symbols.slopes(self.angle)[:, None, None] * per_angle
         if isinstance(self.centre, tuple):
-            centroid = np.array([symbols.value(value) for value in self.centre])
-            centroid_slopes = np.column_stack([symbols.slopes(value) for value in self.centre])
-        translation = np.array([symbols.value(value) for value in self.translation])
-        translation_slopes = np.column_stack([symbols.slopes(value) for value in self.translation])
+            centroid, centroid_slopes = symbols.values(self.centre), symbols.vector_slopes(self.centre)
+        translation, translation_slopes = symbols.values(self.translation), symbols.vector_slopes(self.translation)
         return AffineMotion(
             matrix=matrix,
             shift=translation - matrix @ centroid,
