@@ -53,8 +53,8 @@ class NgsolveMesh:
     element_of_cell : (n_cells,) NGSolve's element number of each cell; ``cell_of_element`` is its inverse.
     """
 
-    #: What NGSolve's elements of the cells are: volumes.
-    kind = ngs.VOL
+    #: What NGSolve's elements of the cells are, volumes, of which shapes, and the space of functions on them.
+    kind, shapes, functions = ngs.VOL, (ngs.HEX, ngs.TET, ngs.PRISM), ngs.L2
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -114,11 +114,7 @@ class NgsolveMesh:
             position += len(surface)
         combinations = Combinations(members, len(first))
         for region in range(combinations.count):
-            face = netgen_meshing.FaceDescriptor(  # pyright: ignore[reportAttributeAccessIssue]
-                surfnr=region + 1, domin=1, domout=0, bc=region + 1
-            )
-            target.Add(face)
-            target.SetBCName(region, region_name(region))
+            add_face_region(target, region)
             vertices = np.where(nodes >= 0, self._vertex[nodes], -1)[first[combinations.number == region]]
             for corners in (3, 4):
                 data = vertices[(vertices >= 0).sum(axis=1) == corners][:, :corners].astype(np.int32)
@@ -154,24 +150,15 @@ class NgsolveMesh:
         columns = values.reshape(self.mesh.n_cells, -1)
         parts = []
         for column in columns.T:
-            part = self._constant()
+            part = ngs.GridFunction(self.functions(self.ngs, order=0))
             part.vec.FV().NumPy()[self.element_of_cell] = column
             parts.append(part)
         return parts[0] if values.ndim == 1 else ngs.CF(tuple(parts))
 
-    def _constant(self) -> ngs.GridFunction:
-        """A function that is constant in each cell."""
-        return ngs.GridFunction(ngs.L2(self.ngs, order=0))
-
     def mesh_points(self, elements: Indices, reference: Array) -> NDArray:
         """NGSolve's points (p,) in ``elements`` (p,) at its own reference coordinates (p, 3)."""
-        pattern = self.ngs.MapToAllElements(
-            {kind: ngs.IntegrationRule(kind, 0) for kind in (ngs.HEX, ngs.TET, ngs.PRISM)}, ngs.VOL
-        )
-        return self._placed(pattern, elements, reference)
-
-    @staticmethod
-    def _placed(pattern: NDArray, elements: Indices, reference: Array) -> NDArray:
+        rules = {shape: ngs.IntegrationRule(shape, 0) for shape in self.shapes}
+        pattern = self.ngs.MapToAllElements(rules, self.kind)
         points = np.repeat(pattern[:1], len(elements))
         points["nr"] = elements
         points["x"], points["y"], points["z"] = reference.T
@@ -180,6 +167,15 @@ class NgsolveMesh:
 
 def region_name(number: int) -> str:
     return f"region{number}"
+
+
+def add_face_region(target: Any, number: int) -> None:
+    """Add a region of faces to a mesh of Netgen's."""
+    face = netgen_meshing.FaceDescriptor(  # pyright: ignore[reportAttributeAccessIssue]
+        surfnr=number + 1, domin=1, domout=0, bc=number + 1
+    )
+    target.Add(face)
+    target.SetBCName(number, region_name(number))
 
 
 class Combinations:

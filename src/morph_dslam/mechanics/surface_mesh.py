@@ -6,13 +6,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-import netgen.meshing as netgen_meshing
 import ngsolve as ngs
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
-from morph_dslam.mechanics.ngsolve_mesh import Combinations, NgsolveMesh, region_name
+from morph_dslam.mechanics.ngsolve_mesh import Combinations, NgsolveMesh, add_face_region
 from morph_dslam.meshing.meshes import Mesh, faces_of_cells
 from morph_dslam.meshing.surface_checks import mesh_edges
 
@@ -35,7 +34,7 @@ class SurfaceMesh(NgsolveMesh):
     mesh : with its cell sets, and all cells by the name "all", as surfaces too.
     """
 
-    kind = ngs.BND
+    kind, shapes, functions = ngs.BND, (ngs.TRIG, ngs.QUAD), ngs.SurfaceL2
 
     def __init__(self, mesh: Mesh, edges: Iterable[str] = ()) -> None:
         self.mesh = _with_surfaces(mesh)
@@ -54,11 +53,7 @@ class SurfaceMesh(NgsolveMesh):
 
     def _add_cells(self, target: Any) -> Indices:
         for region in range(self._regions.count):
-            face = netgen_meshing.FaceDescriptor(  # pyright: ignore[reportAttributeAccessIssue]
-                surfnr=region + 1, domin=1, domout=0, bc=region + 1
-            )
-            target.Add(face)
-            target.SetBCName(region, region_name(region))
+            add_face_region(target, region)
         return self._add_elements(target, dim=2)
 
     def _add_edges(self, target: Any, name: str, number: int) -> None:
@@ -69,12 +64,12 @@ class SurfaceMesh(NgsolveMesh):
 
     def edges_on(self, name: str) -> Indices:
         """Edges (e, 2), by their end nodes, all of whose nodes are in a set. Raises StudyError if there is none."""
-        edges = mesh_edges(self.mesh)
+        edges, _ = mesh_edges(self.mesh)
         held = np.append(np.isin(np.arange(self.mesh.n_nodes), self.mesh.set_nodes(name)), True)
-        rows = held[edges.nodes].all(axis=1)
+        rows = held[edges].all(axis=1)
         if not rows.any():
             raise StudyError(f"no edge of the mesh has all of its nodes in the set '{name}': name one along edges")
-        return np.unique(np.sort(edges.nodes[rows, :2], axis=1), axis=0)
+        return np.unique(np.sort(edges[rows, :2], axis=1), axis=0)
 
     def edge_numbers(self, name: str) -> list[int]:
         """NGSolve's numbers of the edges all of whose nodes are in a set; raises as `edges_on` does."""
@@ -92,15 +87,6 @@ class SurfaceMesh(NgsolveMesh):
     def edge_region(self, name: str) -> ngs.Region:
         """The edges of one of the sets that the mesh was made with."""
         return self.ngs.BBoundaries(f"edges{self._edge_sets.index(name) + 1}")
-
-    def _constant(self) -> ngs.GridFunction:
-        return ngs.GridFunction(ngs.SurfaceL2(self.ngs, order=0))
-
-    def mesh_points(self, elements: Indices, reference: Array) -> NDArray:
-        pattern = self.ngs.MapToAllElements(
-            {kind: ngs.IntegrationRule(kind, 0) for kind in (ngs.TRIG, ngs.QUAD)}, ngs.BND
-        )
-        return self._placed(pattern, elements, reference)
 
 
 def _with_surfaces(mesh: Mesh) -> Mesh:

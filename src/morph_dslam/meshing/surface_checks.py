@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -17,22 +15,11 @@ Indices = NDArray[np.int64]
 ON_EDGE = 1e-6
 
 
-@dataclass(frozen=True)
-class MeshEdges:
-    """The edges of the cells of a surface, one row for each edge of each cell.
+def mesh_edges(mesh: Mesh) -> tuple[Indices, Indices]:
+    """Every edge of every cell of a surface: (e, 3) from, to, and the node between or -1, and its cell (e,).
 
-    Attributes
-    ----------
-    nodes : (e, 3) from, to, and the node between them or -1.
-    cells : (e,) the cell that the edge belongs to.
+    Edges run as the cell turns.
     """
-
-    nodes: Indices
-    cells: Indices
-
-
-def mesh_edges(mesh: Mesh) -> MeshEdges:
-    """Every edge of every cell, running as the cell turns."""
     nodes, cells = [], []
     for block, start in zip(mesh.blocks, mesh.block_starts()[:-1], strict=True):
         corners = block.type.corners
@@ -43,7 +30,7 @@ def mesh_edges(mesh: Mesh) -> MeshEdges:
             row[:, 0], row[:, 1], row[:, 2] = block.connectivity[:, first], block.connectivity[:, second], middle
             nodes.append(row)
             cells.append(np.arange(start, start + len(row)))
-    return MeshEdges(np.concatenate(nodes), np.concatenate(cells))
+    return np.concatenate(nodes), np.concatenate(cells)
 
 
 def check_surface(mesh: Mesh) -> None:
@@ -52,8 +39,8 @@ def check_surface(mesh: Mesh) -> None:
     Checked are edges with more than two cells, corners in the middle of an edge of other cells, and neighbours with
     opposite sides up.
     """
-    edges = mesh_edges(mesh)
-    ends = edges.nodes[:, :2]
+    nodes, of_cell = mesh_edges(mesh)
+    ends = nodes[:, :2]
     _, first, which, counts = np.unique(
         np.sort(ends, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
@@ -69,7 +56,7 @@ def check_surface(mesh: Mesh) -> None:
     rising = np.bincount(which, weights=np.where(ends[:, 0] < ends[:, 1], 1.0, -1.0))
     turned = np.flatnonzero((counts == 2) & (rising != 0.0))
     if len(turned):
-        cells = np.sort(edges.cells[which == turned[0]])
+        cells = np.sort(of_cell[which == turned[0]])
         raise StudyError(
             f"neighbouring cells of the surface have opposite sides up at {len(turned)} edges, the first "
             f"{place(mesh, ends[first[turned[0]]])} between cells {cells[0]} and {cells[1]}; list the nodes of all "
