@@ -144,4 +144,4 @@ def test_a_shell_takes_the_same_turn() -> None:
 def test_a_shell_that_is_let_go_is_not_turned_that_far() -> None:
     problem = shell_study(twisted_strip(240.0)).problem()
     with pytest.raises(SolverError, match="90"):
-        relaxed_state(problem, problem.symbols.default, problem.area)
+        relaxed_state(problem, problem.symbols.default)

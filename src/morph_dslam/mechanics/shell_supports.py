@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import ngsolve as ngs
 import numpy as np
@@ -19,33 +19,19 @@ Array = NDArray[np.float64]
 IN_PLANE = 0.01
 
 
-@runtime_checkable
-class HoldsDirection(Protocol):
-    """A support that says where the normals on the edges of its set point."""
-
-    @property
-    def on(self) -> str: ...
+@dataclass(frozen=True, eq=False)
+class Clamp(RigidRotation):
+    """Moves a set of a shell as a rigid body, its place and the direction of its normals."""
 
     def undeformed_normal(self, averaged: Any) -> Any:
-        """The normal that is held of the undeformed shell, from that of its cells; not of unit length."""
-        ...
+        """The normal on edges that is held of the undeformed shell, from that of its cells; not of unit length."""
+        return averaged
 
     def edge_normal(self, undeformed: Any, averaged: Any, share: Any) -> Any:
         """The normal that is held, from the undeformed one and from that of the cells; not of unit length.
 
         It has turned by that ``share`` of the angle that the support turns it by.
         """
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Clamp(RigidRotation):
-    """Moves a set of a shell as a rigid body, its place and the direction of its normals."""
-
-    def undeformed_normal(self, averaged: Any) -> Any:
-        return averaged
-
-    def edge_normal(self, undeformed: Any, averaged: Any, share: Any) -> Any:
         x, y, z = np.array(self.axis, dtype=float) / np.linalg.norm(self.axis)
         cross = cross_matrix(x, y, z)
         matrices = [ngs.CF(tuple(m.ravel()), dims=(3, 3)) for m in (np.eye(3), cross, cross @ cross)]
@@ -88,11 +74,17 @@ class SymmetryPlane:
         return AffineMotion(np.zeros((3, 3)), np.zeros(3), np.zeros((d, 3, 3)), np.zeros((d, 3)))
 
     def undeformed_normal(self, averaged: Any) -> Any:
+        """See `Clamp`."""
         across = ngs.CF(tuple(np.eye(3)[self.axis]))
         return averaged - (averaged * across) * across
 
     def edge_normal(self, undeformed: Any, averaged: Any, share: Any) -> Any:
+        """See `Clamp`."""
         return self.undeformed_normal(averaged)
+
+
+#: Supports that say where the normals on the edges of their set point.
+HoldsDirection = Clamp | SymmetryPlane
 
 
 def clamped(on: str) -> Clamp:

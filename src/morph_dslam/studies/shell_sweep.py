@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,7 @@ def _moved_after_loads(problem: ShellProblem, mu: Array) -> State:
     try:
         start = loaded_state(resting, mu)
     except SolverError:
-        start = relaxed_state(resting, mu, resting.area)
+        start = relaxed_state(resting, mu)
     return loaded_state(problem, mu, start.dofs)
 
 
@@ -58,7 +57,7 @@ class ShellSweep(SolidSweep):
         problem, mu = self.problem, self.problem.symbols.default
         ways = [loaded_state, _moved_after_loads] if problem.loads and problem.prescribed(mu).any() else [loaded_state]
         unstable, failure = None, SolverError("no equilibrium found")
-        for way in (*ways, partial(relaxed_state, area=problem.area)):
+        for way in (*ways, relaxed_state):
             try:
                 found = way(problem, mu)
             except SolverError as error:
@@ -78,16 +77,11 @@ class ShellSweep(SolidSweep):
         return self._with_slopes(unstable)
 
     def response_fields(self, state: Any, loads: Array, responses: Array) -> dict[str, Array]:
-        """See `unknown_loads.LoadableProblem`."""
+        """See `SolidSweep`."""
         forces = self._tangent(state).apply(responses) - loads
         slopes = self.problem.response_slopes(state.dofs, state.mu, responses)
         return slopes | response_reactions(self.problem, state.dofs, state.mu, responses, forces)
 
-    def take_snapshot(self, state: Any) -> Snapshot:
-        """Displacement, stresses of both faces and their slopes, reactions, and the tangent's negative pivots."""
-        problem = self.problem
-        found = shell_snapshot(problem, state.dofs, state.mu)
-        slopes = problem.sample_slopes(state.dofs, state.mu, state.slopes)
-        if state.negative_pivots is not None:
-            found.outputs["negative_pivots"] = np.array(state.negative_pivots)
-        return replace(found, sensitivities=slopes)
+    def _snapshot(self, state: Any) -> Snapshot:
+        found = shell_snapshot(self.problem, state.dofs, state.mu)
+        return replace(found, sensitivities=self.problem.sample_slopes(state.dofs, state.mu, state.slopes))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -77,7 +78,8 @@ def solid_snapshot(
             changes = [at_nodes @ change for change in problem.shape.coordinate_slopes(problem.symbols)]
             derivatives["displacement"] = derivatives["displacement"] + np.array(changes)
     if slopes is not None and force_slopes is not None:
-        derivatives |= _reaction_slopes(problem, dofs, mu, slopes, force_slopes)
+        of_reactions = partial(problem.reaction_slopes, dofs, mu, slopes, force_slopes)
+        derivatives |= _reaction_fields(problem, of_reactions)
     outputs = support_reactions(problem, dofs, mu) if reactions else {}
     return Snapshot(mu, fields, derivatives, outputs | _coupled_motions(problem, dofs))
 
@@ -105,41 +107,30 @@ def support_reactions(problem: SolidProblem, dofs: Array, mu: Array) -> dict[str
     return outputs
 
 
-def _reaction_slopes(
-    problem: SolidProblem, dofs: Array, mu: Array, slopes: Array, force_slopes: Array
-) -> dict[str, Array]:
-    """Derivatives (d, 1, 3) of `support_reactions`, under the names that reactions have as fields."""
-    outputs = {}
-    for name in problem.held_sets:
-        parts = problem.reaction_slopes(dofs, mu, slopes, force_slopes, name, np.zeros(3))
-        for kind, part in zip((FORCE, MOMENT), parts, strict=True):
-            outputs[REACTION + kind + name] = part[:, None]
-    return outputs
-
-
-def solid_responses(problem: SolidProblem, dofs: Array, mu: Array, changes: Array, forces: Array) -> dict[str, Array]:
-    """Derivatives (c, n, k) of displacement, stress, strain and reactions by loads that act besides the study's.
-
-    Parameters
-    ----------
-    dofs : (n,) of the solution.
-    changes : (c, n) of the dofs by each load.
-    forces : (c, n) of the residual by each, at the dofs that supports hold.
-    """
-    fields = _named(problem.response_slopes(dofs, mu, changes))
-    return fields | response_reactions(problem, dofs, mu, changes, forces)
+def _reaction_fields(problem: SolidProblem, slopes: Callable[[str, Array], tuple[Array, Array]]) -> dict[str, Array]:
+    """Derivatives (c, 1, 3) of `support_reactions`, given those of each set, by names of fields."""
+    found = {name: slopes(name, np.zeros(3)) for name in problem.held_sets}
+    return {
+        REACTION + kind + name: part[:, None]
+        for name, parts in found.items()
+        for kind, part in zip((FORCE, MOMENT), parts, strict=True)
+    }
 
 
 def response_reactions(
     problem: SolidProblem, dofs: Array, mu: Array, changes: Array, forces: Array
 ) -> dict[str, Array]:
-    """The reactions' part of `solid_responses`: (c, 1, 3) each."""
-    outputs = {}
-    for name in problem.held_sets:
-        parts = problem.response_reactions(dofs, mu, changes, forces, name, np.zeros(3))
-        for kind, part in zip((FORCE, MOMENT), parts, strict=True):
-            outputs[REACTION + kind + name] = part[:, None]
-    return outputs
+    """Derivatives (c, 1, 3) of `support_reactions` by loads that act besides the study's.
+
+    Parameters
+    ----------
+    problem : the solid or shell.
+    dofs : (n,) of the solution.
+    mu : (d,) parameters, SI.
+    changes : (c, n) of the dofs by each load.
+    forces : (c, n) of the residual by each, at the dofs that supports hold.
+    """
+    return _reaction_fields(problem, partial(problem.response_reactions, dofs, mu, changes, forces))
 
 
 def follow(
@@ -283,20 +274,24 @@ class SolidSweep:
         return _SolidState(state.mu, state.dofs, slopes, unstable_directions(self.problem, tangent))
 
     def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
-        """See `unknown_loads.LoadableProblem`."""
+        """The functions on the surface of this name, or on all of a shell; see `LoadedSurface.of`."""
         return self.problem.loaded_surface(name, inward)
 
     def response(self, state: _SolidState) -> Respond:
-        """See `unknown_loads.LoadableProblem`."""
+        """How the dofs of a solved state answer loads at them, by its tangent."""
         return self._tangent(state).solve
 
     def response_fields(self, state: _SolidState, loads: Array, responses: Array) -> dict[str, Array]:
-        """See `unknown_loads.LoadableProblem`."""
+        """By the names in the model file, (c, n, k) for each of ``loads`` (c, n_dofs) with its response (c, n_dofs)."""
         forces = self._tangent(state).apply(responses) - loads
-        return solid_responses(self.problem, state.dofs, state.mu, responses, forces)
+        fields = _named(self.problem.response_slopes(state.dofs, state.mu, responses))
+        return fields | response_reactions(self.problem, state.dofs, state.mu, responses, forces)
 
     def second_order(self, state: _SolidState, responses: Array) -> Array | None:
-        """See `unknown_loads.LoadableProblem`."""
+        """The displacement (p, n, 3) of the nodes that the product of two loads' coefficients adds; None if unknown.
+
+        Of each pair a <= b of ``responses`` (s, n_dofs), row by row.
+        """
         if self.problem.contact:  # a gap that closes has no second derivative
             return None
         pairs = [(a, b) for a in range(len(responses)) for b in range(a, len(responses))]
@@ -319,11 +314,14 @@ class SolidSweep:
 
     def take_snapshot(self, state: _SolidState) -> Snapshot:
         """Fields at the nodes, their slopes, reactions, and the tangent's negative pivots."""
-        forces = self._tangent(state).apply(state.slopes) + self.problem.residual_slopes(state.dofs, state.mu)
-        snapshot = solid_snapshot(self.problem, state.dofs, state.mu, state.slopes, forces)
+        snapshot = self._snapshot(state)
         if state.negative_pivots is not None:
             snapshot.outputs["negative_pivots"] = np.array(state.negative_pivots)
         return snapshot
+
+    def _snapshot(self, state: _SolidState) -> Snapshot:
+        forces = self._tangent(state).apply(state.slopes) + self.problem.residual_slopes(state.dofs, state.mu)
+        return solid_snapshot(self.problem, state.dofs, state.mu, state.slopes, forces)
 
 
 Loadable = TypeVar("Loadable", bound=SolidSweep)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -21,7 +21,6 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.load_modes import (
     SOFTLESS,
     LoadedSurface,
-    Respond,
     common_tractions,
     pressing_tractions,
     softest_tractions,
@@ -32,9 +31,10 @@ from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.unknown_loads import LEAST_COMPLIANCE, ROOT, SecondOrder, UnknownLoads, packed_root
 from morph_dslam.reduction.pod import compute_pod
 from morph_dslam.reduction.regression import design_matrix
-from morph_dslam.studies.problem import ParametricStudy, SweepProblem, bounds
+from morph_dslam.studies.problem import ParametricStudy, bounds
 from morph_dslam.studies.sections import UnknownLoadsSection
 from morph_dslam.studies.snapshots import load_state
+from morph_dslam.studies.solid_sweep import SolidSweep
 from morph_dslam.studies.solutions import Snapshots
 
 Array = NDArray[np.float64]
@@ -52,30 +52,6 @@ _SECOND = "second order"
 TOLERANCE, MOST_FUNCTIONS = 2e-2, 12
 
 
-@runtime_checkable
-class LoadableProblem(SweepProblem, Protocol):
-    """A sweep's problem whose states tell how they answer loads."""
-
-    def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
-        """The functions on the surface of this name, or on all of a shell; see `LoadedSurface.of`."""
-        ...
-
-    def response(self, state: Any) -> Respond:
-        """How the dofs of a solved state answer loads at them, by its tangent."""
-        ...
-
-    def response_fields(self, state: Any, loads: Array, responses: Array) -> dict[str, Array]:
-        """By the names in the model file, (c, n, k) for each of ``loads`` (c, n_dofs) with its response (c, n_dofs)."""
-        ...
-
-    def second_order(self, state: Any, responses: Array) -> Array | None:
-        """The displacement (p, n, 3) of the nodes that the product of two loads' coefficients adds; None if unknown.
-
-        Of each pair a <= b of ``responses`` (s, n_dofs), row by row.
-        """
-        ...
-
-
 def reduce_unknown_loads(
     study: ParametricStudy, section: UnknownLoadsSection, snapshots: Snapshots
 ) -> tuple[UnknownLoads, dict[str, Any]]:
@@ -87,7 +63,7 @@ def reduce_unknown_loads(
         If the study's kind of problem has no tangents to tell.
     """
     problem = snapshots.problem() if snapshots.problem is not None else None
-    if not isinstance(problem, LoadableProblem):
+    if not isinstance(problem, SolidSweep):
         raise StudyError(
             "[unknown_loads] is for elastic solids and shells that are solved here, not for viscoelastic ones: leave "
             "it out"
@@ -129,7 +105,7 @@ def reduce_unknown_loads(
 
 
 def _responses(
-    problem: LoadableProblem, surface: LoadedSurface, tractions: Array, files: Sequence[Path]
+    problem: SolidSweep, surface: LoadedSurface, tractions: Array, files: Sequence[Path]
 ) -> tuple[dict[str, list[NDArray]], Array]:
     """What tractions (m, a, k) do in each of the solved states, by field, and their softest combinations (s, m)."""
     found, soft, combined = dict[str, list[NDArray]](), np.empty(0), np.empty(0)

@@ -6,13 +6,16 @@ longer than the one before (Kelley and Keyes, SIAM Journal on Numerical Analysis
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import SolverError
-from morph_dslam.mechanics.solvers.newton import LARGEST_TURN, Equations, State, size, solve
+from morph_dslam.mechanics.solvers.newton import LARGEST_TURN, State, size, solve
+
+if TYPE_CHECKING:
+    from morph_dslam.mechanics.shell_problem import ShellProblem
 
 Array = NDArray[np.float64]
 #: Length of the first step in units of the body's size; factors of the drag after a step that converged, or did not.
@@ -22,23 +25,8 @@ MAX_STEPS = 100
 AT_REST = 1e-4
 
 
-class Dragged(Equations, Protocol):
-    """Equations of a body that can be tied to a state."""
-
-    @property
-    def length(self) -> float: ...
-
-    def turn_from(self, x: Array, mu: Array) -> float:
-        """Angle, rad, by which supports that are at rest in ``x`` (n,) turn on the way to parameters (d,)."""
-        ...
-
-    def set_drag(self, drag: float, x: Array) -> None:
-        """Tie the body to ``x`` (n,) by ``drag``, a force per area and displacement; 0 lets it go."""
-        ...
-
-
-def relaxed_state(equations: Dragged, mu: Array, area: float) -> State:
-    """Where a body of this ``area``, m2, comes to rest from the undeformed state under the loads at ``mu`` (d,).
+def relaxed_state(equations: ShellProblem, mu: Array) -> State:
+    """Where a shell comes to rest from the undeformed state under the loads at ``mu`` (d,).
 
     Raises SolverError if it does not in `MAX_STEPS` steps, or if supports turn by more than `newton.LARGEST_TURN`.
     """
@@ -48,7 +36,7 @@ def relaxed_state(equations: Dragged, mu: Array, area: float) -> State:
         )
     x = equations.prescribed(mu)
     forces = np.where(equations.free, equations.residual(np.zeros(equations.n_dofs), mu), 0.0)
-    drag = max(float(np.linalg.norm(forces)), 1e-12) / (FIRST * equations.length * area)
+    drag = max(float(np.linalg.norm(forces)), 1e-12) / (FIRST * equations.length * equations.area)
     state = State(mu, x)
     try:
         for _ in range(MAX_STEPS):
