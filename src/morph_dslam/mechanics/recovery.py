@@ -66,15 +66,14 @@ def _derived(name: str, F: Array, P: Array) -> Array:
     return P @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
 
 
-def _derived_change(name: str, F: Array, P: Array, dF: Array, dP: Array) -> Array:
-    """Change (p, 3, 3) of a field with those of F and P."""
-    if name == "deformation_gradient":
-        return dF
-    if name == "strain":
-        product = np.swapaxes(F, 1, 2) @ dF
-        return 0.5 * (product + np.swapaxes(product, 1, 2))
-    if name == "first_piola_kirchhoff":
-        return dP
+def _strain_change(F: Array, dF: Array) -> Array:
+    """Change (p, 3, 3) of the strain with that of F."""
+    product = np.swapaxes(F, 1, 2) @ dF
+    return 0.5 * (product + np.swapaxes(product, 1, 2))
+
+
+def _stress_change(F: Array, P: Array, dF: Array, dP: Array) -> Array:
+    """Change (p, 3, 3) of the Cauchy stress with those of F and P."""
     J = np.linalg.det(F)[:, None, None]
     growth = np.trace(np.linalg.solve(F, dF), axis1=1, axis2=2)[:, None, None]
     return (dP @ np.swapaxes(F, 1, 2) + P @ np.swapaxes(dF, 1, 2) - growth * (P @ np.swapaxes(F, 1, 2))) / J
@@ -195,14 +194,9 @@ class Recovery:
         return result
 
     def slopes_at_nodes(
-        self,
-        dofs: Array,
-        mu: Array,
-        dof_slopes: Array,
-        names: tuple[str, ...] = ("strain", "stress"),
-        by_parameters: bool = True,
+        self, dofs: Array, mu: Array, dof_slopes: Array, by_parameters: bool = True
     ) -> dict[str, Array]:
-        """Total derivatives (d, n, c) of the fields at nodes, by the parameters or by loads beside them.
+        """Total derivatives (d, n, c) of displacement, strain and stress, by the parameters or by loads beside them.
 
         Parameters
         ----------
@@ -218,10 +212,21 @@ class Recovery:
             raise ArgumentError("a viscous solid has no derivatives of its fields: they depend on its history")
         points, average = self._node_rule()
         result = {"displacement": np.array([self._problem.nodal_displacement(s) for s in dof_slopes])}
-        indices = range(len(dof_slopes)) if by_parameters else [None] * len(dof_slopes)
-        directions = list(zip(indices, dof_slopes, strict=True))
-        slopes = self._slopes(names, dofs, mu, directions, points)
-        return result | {name: np.array([average @ slope for slope in found]) for name, found in slopes.items()}
+        self._set(dofs, mu)
+        F, P = self._gradient_and_stress(points)
+        tangent = self._by_region([law.tangent for law in self._laws], points, (9, 9))
+        strains, stresses = [], []
+        for number, slope in enumerate(dof_slopes):
+            index = number if by_parameters else None
+            self._solution.set_change(dofs, slope, index)
+            dF = self._by_region([self._solution.change] * len(self._laws), points)
+            dP = (tangent @ dF.reshape(-1, 9, 1)).reshape(-1, 3, 3) + self._stress_changes(index, points)
+            explicit = None if index is None else self._solution.explicit.get(index)
+            if explicit is not None:
+                dF = dF + self._by_region([explicit] * len(self._laws), points)
+            strains.append(average @ _components("strain", _strain_change(F, dF)))
+            stresses.append(average @ _components("stress", _stress_change(F, P, dF, dP)))
+        return result | {"strain": np.array(strains), "stress": np.array(stresses)}
 
     def _set(self, dofs: Array, mu: Array) -> None:
         self._problem.symbols.set(mu)
@@ -236,30 +241,6 @@ class Recovery:
         """F and P (p, 3, 3) of the solution that is set."""
         F = self._by_region([self._solution.F] * len(self._laws), points)
         return F, self._by_region([law.stress for law in self._laws], points)
-
-    def _slopes(
-        self,
-        names: tuple[str, ...],
-        dofs: Array,
-        mu: Array,
-        directions: list[tuple[int | None, Array]],
-        points: NDArray,
-    ) -> dict[str, list[Array]]:
-        """Derivatives of fields along changes of the solution, each with the parameter that causes it or None."""
-        self._set(dofs, mu)
-        F, P = self._gradient_and_stress(points)
-        tangent = self._by_region([law.tangent for law in self._laws], points, (9, 9))
-        result: dict[str, list[Array]] = {name: [] for name in names}
-        for index, slope in directions:
-            self._solution.set_change(dofs, slope, index)
-            dF = self._by_region([self._solution.change] * len(self._laws), points)
-            dP = (tangent @ dF.reshape(-1, 9, 1)).reshape(-1, 3, 3) + self._stress_changes(index, points)
-            explicit = None if index is None else self._solution.explicit.get(index)
-            if explicit is not None:
-                dF = dF + self._by_region([explicit] * len(self._laws), points)
-            for name in names:
-                result[name].append(_components(name, _derived_change(name, F, P, dF, dP)))
-        return result
 
     def _stress_changes(self, index: int | None, points: NDArray) -> Array:
         """Change (p, 3, 3) of P with pressures in the direction that is set, and with a parameter itself."""
