@@ -295,16 +295,25 @@ def _affordable_paths(unknowns: list[int], paths: int, increments: float) -> int
 
     Raises _NotEstimated where it affords none.
     """
+    ratio = 2.0 * (unknowns[1] / unknowns[0]) ** TIME_POWER
+    return _afforded(unknowns, paths, ratio, ratio * SWEEP_TANGENTS * increments, ("path", "paths"))
+
+
+def _afforded(unknowns: list[int], count: int, ratio: float, tangents: float, names: tuple[str, str]) -> int:
+    """How many finer solutions a quarter of a build of ``count``, or `FLOOR`, affords.
+
+    Each takes as long as ``ratio`` of the build's and as so many ``tangents``; ``names`` are those of one and of many.
+    Raises _NotEstimated where none is afforded.
+    """
     own, finer = unknowns
-    ratio = 2.0 * (finer / own) ** TIME_POWER
-    of_one = ratio * SWEEP_TANGENTS * increments * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
-    count = int(max(SHARE / (1.0 - SHARE) * paths / ratio, FLOOR / of_one))
-    if count < 1:
+    seconds_of_one = tangents * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
+    afforded = int(max(SHARE / (1.0 - SHARE) * count / ratio, FLOOR / seconds_of_one))
+    if afforded < 1:
         raise _NotEstimated(
-            f"one path with {finer} unknowns of finer elements would take as long as {ratio:.0f} of the build's "
-            f"{paths} paths, more than {_LIMIT}: {_ASK}"
+            f"one {names[0]} with {finer} unknowns of finer elements would take as long as {ratio:.0f} of the build's "
+            f"{count} {names[1]}, more than {_LIMIT}: {_ASK}"
         )
-    return count
+    return afforded
 
 
 def _check_same_branch(problem: SolidProblem, found: State, pivots: int) -> None:
@@ -340,15 +349,7 @@ def _affordable(unknowns: list[int], solves: int, iterative: bool) -> int:
     """
     own, finer = unknowns
     tangents = ITERATIVE_TANGENTS * finer / own if iterative else FINER_TANGENTS * (finer / own) ** TIME_POWER
-    time_of_one = tangents / SWEEP_TANGENTS
-    seconds_of_one = tangents * SECONDS_OF_A_MILLION * (1e-6 * own) ** TIME_POWER
-    count = int(max(SHARE / (1.0 - SHARE) * solves / time_of_one, FLOOR / seconds_of_one))
-    if count < 1:
-        raise _NotEstimated(
-            f"one state with {finer} unknowns of finer elements would take as long as {time_of_one:.0f} of the build's "
-            f"{solves} solves, more than {_LIMIT}: {_ASK}"
-        )
-    return count
+    return _afforded(unknowns, solves, tangents / SWEEP_TANGENTS, tangents, ("state", "solves"))
 
 
 def _is_too_large(problem: SolidProblem) -> bool:
