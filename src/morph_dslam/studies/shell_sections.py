@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import ngsolve as ngs
@@ -19,7 +18,6 @@ from morph_dslam.mechanics.shell_supports import Clamp, SymmetryPlane, clamped
 from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.mechanics.surface_mesh import SurfaceMesh
 from morph_dslam.meshing import surface_generators
-from morph_dslam.meshing.mesh_checks import check_mesh
 from morph_dslam.meshing.mesh_files import load_surface_mesh
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.meshing.surface_checks import check_surface
@@ -41,9 +39,8 @@ from morph_dslam.studies.solid_sections import (
     RotationSupport,
     Triple,
     Value,
-    check_unit,
     few_cells,
-    file_stamp,
+    make_mesh,
     mesh_kind,
     triple,
 )
@@ -153,20 +150,7 @@ SurfaceSection = Annotated[
 
 def shell_mesh(section: Any) -> Mesh:
     """The checked mesh of a `SurfaceSection`; made once, and again when its file has been written again."""
-    return _made(section, file_stamp(section.file) if isinstance(section, _FileSurface) else None)
-
-
-@lru_cache(maxsize=2)
-def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
-    mesh = section.make()
-    if isinstance(section, _FileSurface):
-        check_unit(mesh, section.unit, "mesh.unit")
-    try:
-        check_mesh(mesh)
-        check_surface(mesh)
-    except StudyError as error:
-        raise StudyError(f"mesh: {error}") from error
-    return mesh
+    return make_mesh(section, check_surface)
 
 
 class ShellSection(Section):

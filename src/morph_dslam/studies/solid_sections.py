@@ -183,7 +183,7 @@ def check_unit(mesh: Mesh, unit: str, key: str) -> None:
     raise StudyError(f'{key}: in "{unit}" the mesh measures {size} m, which is hardly meant; {advice}')
 
 
-def file_stamp(path: Path) -> tuple[int, int]:
+def _file_stamp(path: Path) -> tuple[int, int]:
     """What changes when a file is written again: time in nanoseconds, and size; zeros if there is none."""
     try:
         found = path.stat()
@@ -192,18 +192,19 @@ def file_stamp(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def make_mesh(section: Any) -> Mesh:
-    """The mesh of a `MeshSection`, checked; made once, and again when its file has been written again."""
-    return _made(section, file_stamp(section.file) if isinstance(section, FileMesh) else None)
+def make_mesh(section: Any, *checks: Callable[[Mesh], None]) -> Mesh:
+    """The mesh of a `MeshSection`, checked, by more ``checks`` too; made once, and again when its file has changed."""
+    return _made(section, checks, _file_stamp(section.file) if isinstance(section, FileMesh) else None)
 
 
 @lru_cache(maxsize=2)
-def _made(section: Any, stamp: tuple[int, int] | None) -> Mesh:
+def _made(section: Any, checks: tuple[Callable[[Mesh], None], ...], stamp: tuple[int, int] | None) -> Mesh:
     mesh = section.make()
     if isinstance(section, FileMesh):
         check_unit(mesh, section.unit, "mesh.unit")
     try:
-        check_mesh(mesh)
+        for check in (check_mesh, *checks):
+            check(mesh)
     except StudyError as error:
         raise StudyError(f"mesh: {error}") from error
     return mesh
