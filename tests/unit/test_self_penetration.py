@@ -43,27 +43,27 @@ def inside_another_turn(mesh, pitch, rise):
 def test_the_overlap_of_a_coiled_bar_is_found_node_by_node():
     mesh = block((LENGTH, THICK, THICK), (160, 4, 4), "hex8")
     pitch, rise = 0.7, 0.13
-    found = SurfaceContact(mesh.nodes, mesh.surface_triangles()).find(coiled(mesh, pitch, rise))
+    found, depths = SurfaceContact(mesh.nodes, mesh.surface_triangles()).find(coiled(mesh, pitch, rise))
     expected = inside_another_turn(mesh, pitch, rise)
     on_surface = np.unique(mesh.surface_triangles())
     surely = on_surface[expected[on_surface] > 0.02]
     surely_not = on_surface[expected[on_surface] < -0.02]
     assert len(surely) > 20
-    assert np.isin(surely, found.nodes).all()
-    assert not np.isin(found.nodes, surely_not).any()
+    assert np.isin(surely, found).all()
+    assert not np.isin(found, surely_not).any()
     # The turns overlap by what the pitch leaves of the bar's thickness.
-    assert found.depths.max() == pytest.approx(THICK - pitch, rel=0.05)
+    assert depths.max() == pytest.approx(THICK - pitch, rel=0.05)
 
 
 def test_turns_that_pass_each_other_are_not_accused():
     mesh = block((LENGTH, THICK, THICK), (160, 4, 4), "hex8")
     surface = SurfaceContact(mesh.nodes, mesh.surface_triangles())
-    assert len(surface.find(coiled(mesh, 1.02, 0.0)).nodes) == 0
-    assert len(surface.find(coiled(mesh, 0.0, 1.02)).nodes) == 0
-    assert len(surface.find(mesh.nodes).nodes) == 0
+    assert len(surface.find(coiled(mesh, 1.02, 0.0))[0]) == 0
+    assert len(surface.find(coiled(mesh, 0.0, 1.02))[0]) == 0
+    assert len(surface.find(mesh.nodes)[0]) == 0
     # Strongly squeezed and sheared, but nowhere through itself.
     sheared = mesh.nodes @ np.array([[0.3, 0.0, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    assert len(surface.find(sheared).nodes) == 0
+    assert len(surface.find(sheared)[0]) == 0
 
 
 def test_the_certificate_names_the_states_and_the_depth():

@@ -79,7 +79,7 @@ def equivalent_errors(model: ReducedModel, mu: Array, error: Array, free_pose: b
         least = np.sqrt(len(nodes)) * MEASURED * extent * (root * ranges[-model.n_loads :, None]).T
         rows = np.vstack([effects, np.hstack([np.zeros((len(least), len(ranges) - len(least))), least])])
         wanted = np.append(wanted, np.zeros(len(least)))
-    poses = _rigid_motions((model.nodes + value)[nodes]) if free_pose else np.zeros((effects.shape[0], 0))
+    poses = rigid_motions((model.nodes + value)[nodes]) if free_pose else np.zeros((effects.shape[0], 0))
     rigid = np.vstack([poses, np.zeros((len(rows) - len(poses), poses.shape[1]))])
     # The parameters make good what is left of their effects and of the error by the best rigid motion of each.
     rows, wanted = (part - rigid @ (rigid.T @ part) for part in (rows, wanted))
@@ -91,7 +91,7 @@ def equivalent_errors(model: ReducedModel, mu: Array, error: Array, free_pose: b
     return EquivalentErrors(found, _rms(left.reshape(-1, 3)), _rms(in_object.reshape(-1, 3)), products)
 
 
-def _rigid_motions(positions: Array) -> Array:
+def rigid_motions(positions: Array) -> Array:
     """Shifts and small turns of points (n, 3) as orthonormal columns (3 n, 6)."""
     arms = positions - positions.mean(axis=0)
     motions = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(arms), 1)), np.cross(axis, arms))]

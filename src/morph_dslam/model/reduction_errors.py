@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model.functions import Functions
 from morph_dslam.model.hidden_changes import Hidden, HiddenChanges, anywhere
-from morph_dslam.model.parameter_errors import mean_products, surface_modes
+from morph_dslam.model.parameter_errors import mean_products, rigid_motions, surface_modes
 from morph_dslam.model.reduced_model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -38,9 +38,7 @@ def errors_on_modes(model: ReducedModel, errors: Iterable[Array]) -> list[list[f
 def _deforming_modes(model: ReducedModel) -> Array:
     """The displacement's modes (m, 3 s) at the surface's nodes (s,), without rigid motions."""
     nodes, modes = np.unique(model.triangles), surface_modes(model)
-    arms = model.nodes[nodes] - model.nodes[nodes].mean(axis=0)
-    rigid = [motion for axis in np.eye(3) for motion in (np.tile(axis, (len(nodes), 1)), np.cross(axis, arms))]
-    motions, _ = np.linalg.qr(np.reshape(rigid, (6, -1)).T)
+    motions = rigid_motions(model.nodes[nodes])
     return np.asarray(modes - (modes @ motions) @ motions.T)
 
 

@@ -97,10 +97,6 @@ class GalerkinEquations:
         """Full solution (n,) of coefficients ``y`` (k,) at parameters ``mu`` (d,)."""
         return self.full.prescribed(mu) + y @ self.modes
 
-    def coefficients(self, x: Array, weights: Array | None = None) -> Array:
-        """Coefficients (k,) of a full solution (n,): its projection, for modes orthonormal in ``weights``."""
-        return self.modes @ (x if weights is None else weights * x)
-
     def state_text(self, mu: Array) -> str:
         """A state (d,) for messages."""
         return where(self.full, mu)
@@ -148,6 +144,8 @@ MOST_MODES = 60
 MOST_CORRECTIONS = 20
 #: After so many corrections the last must be so small a part of the first, or the tangent is made anew.
 PATIENCE, SLOW = 3, 0.05
+#: Highest degree of the prediction that full solutions alone give.
+FIT_DEGREE = 8
 #: The prediction is fitted anew, with this highest degree, at so many times as many solutions as a cubic has
 #: terms, and whenever their number has doubled since.
 REFIT, REFIT_DEGREE = 4, 5
@@ -206,7 +204,6 @@ class ReducedSolver:
     solutions : of them, with their sensitivities.
     box : (d, 2) ends of the parameters.
     tolerance : relative error that the reduction may have.
-    max_degree : highest polynomial degree of the prediction.
 
     Raises
     ------
@@ -220,9 +217,7 @@ class ReducedSolver:
     largest : Euclidean norm of the largest solution over the dofs measured.
     """
 
-    def __init__(
-        self, equations: Equations, solutions: FullSolutions, box: Array, tolerance: float, max_degree: int = 8
-    ) -> None:
+    def __init__(self, equations: Equations, solutions: FullSolutions, box: Array, tolerance: float) -> None:
         self.equations, self._solutions, self._box = equations, solutions, box
         self.measured = np.broadcast_to(np.isfinite(equations.scale), equations.n_dofs)
         self.largest = float(np.linalg.norm(solutions.states[:, self.measured], axis=1).max())
@@ -239,7 +234,7 @@ class ReducedSolver:
         self._size = float(np.linalg.norm(known, axis=1).max())
         self._allowed = SOLVER_TOLERANCE * tolerance * self._size
         self._prediction, _ = fit_functions(
-            solutions.samples, known, slopes, box[:, 0], box[:, 1], max_degree, np.arange(len(known))
+            solutions.samples, known, slopes, box[:, 0], box[:, 1], FIT_DEGREE, np.arange(len(known))
         )
         # what is known so far: parameters, coefficients, inverse tangent (when needed)
         self._samples: list[Array] = list(solutions.samples)

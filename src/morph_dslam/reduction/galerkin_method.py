@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from morph_dslam.mechanics.loads import with_reactions
 from morph_dslam.mechanics.solid import SolidProblem
 from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.model.basis_functions import chebyshev_basis
 from morph_dslam.model.functions import Functions
 from morph_dslam.reduction.galerkin import FullSolutions, ReducedSolver, solid_equations
 from morph_dslam.reduction.grid_functions import (
@@ -30,7 +29,7 @@ from morph_dslam.reduction.grid_functions import (
 )
 from morph_dslam.reduction.pod import compute_pod, truncate
 from morph_dslam.reduction.registry import register_reduction
-from morph_dslam.reduction.sparse_expansion import ScatteredValues, expansion_train, fit_expansion, polynomial_functions
+from morph_dslam.reduction.sparse_expansion import ScatteredValues, chebyshev_train, fit_expansion, polynomial_functions
 from morph_dslam.reduction.task import ReductionTask, parameter_bases
 from morph_dslam.studies.solid_sweep import solid_snapshot
 
@@ -201,11 +200,7 @@ class _Expansion:
         found = (rotation @ self.coefficients[part]).T
         if task.options.format == "polynomial":
             return polynomial_functions(task.box, self.indices, found)
-        degrees = self.indices.max(axis=0)
-        bases = tuple(
-            chebyshev_basis(lower, upper, int(degree)) for (lower, upper), degree in zip(task.box, degrees, strict=True)
-        )
-        return expansion_train(self.indices, found, bases, tolerance)
+        return chebyshev_train(*task.box.T, self.indices, found, tolerance)
 
 
 def _on_grid(task: ReductionTask, sampled: _SampledFields) -> _Grid:

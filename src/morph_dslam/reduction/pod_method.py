@@ -15,15 +15,14 @@ from tqdm import tqdm
 
 from morph_dslam.errors import StudyError
 from morph_dslam.model import ReducedModel, SeparatedField
-from morph_dslam.model.basis_functions import chebyshev_basis
-from morph_dslam.model.functions import Functions, ParameterFunctions
+from morph_dslam.model.functions import Functions
 from morph_dslam.reduction.grid_functions import EvenGrid, functions_on_grid
 from morph_dslam.reduction.line_functions import covers, interpolate_line
 from morph_dslam.reduction.path_functions import TimePaths, fit_paths
 from morph_dslam.reduction.pod import Pod, Truncation, compute_pod, truncate
 from morph_dslam.reduction.registry import register_reduction
 from morph_dslam.reduction.regression import fit_functions
-from morph_dslam.reduction.sparse_expansion import expansion_train
+from morph_dslam.reduction.sparse_expansion import chebyshev_train
 from morph_dslam.reduction.task import ReductionTask, parameter_bases
 from morph_dslam.studies.problem import Snapshot
 
@@ -41,21 +40,21 @@ def reduce_by_pod(task: ReductionTask) -> ReducedModel:
 
     Snapshots of one group (mirror images) are left out together in cross-validation.
     """
-    snapshots, line = task.snapshots, covers(task.samples, task.box)
+    snapshots, options, line = task.snapshots, task.options, covers(task.samples, task.box)
     grid = None if line else EvenGrid.of(task.samples, task.box)
     paths = None if line or grid is not None else TimePaths.of(task.samples, task.parameters)
     _check_choices(task, line or grid is not None, paths is not None)
-    through = task.options.basis in (None, *GRID_BASES) and task.options.format != "polynomial"
+    through = options.basis in (None, *GRID_BASES) and options.format != "polynomial"
     fields, summaries = {}, {}
     for name in tqdm(task.field_names, desc="modes and functions", unit="field"):
         values = task.values(name)
         shape, weights = values.shape[1:], task.weights(values.shape[1])
-        pod = _field_pod(task, values.reshape(len(values), -1), np.repeat(weights, shape[1]))
+        flat, of_components = values.reshape(len(values), -1), np.repeat(weights, shape[1])
+        pod = compute_pod(flat, of_components, FINER * options.tolerance, MORE_MODES * options.max_modes)
         # One snapshot at a time: their weighted copies would be another array as large as all of them.
         coefficients = np.array([pod.project(value.reshape(1, -1))[0] for value in values])
-        kept = truncate(
-            pod.modes.reshape(-1, *shape), coefficients.T, weights, task.options.tolerance, task.options.max_modes
-        )
+        modes = pod.modes.reshape(-1, *shape)
+        kept = truncate(modes, coefficients.T, weights, options.tolerance, options.max_modes)
         coefficients = coefficients @ kept.rotation.T
         if grid is not None and through:
             functions, summary = _on_grid(task, grid, coefficients)
@@ -88,11 +87,6 @@ def _check_choices(task: ReductionTask, ordered: bool, on_paths: bool) -> None:
             f'reduction.format = "{options.format}" of method "pod" needs samples on a grid and splines: '
             'use "polynomial" or "tensor_train", or sampling.scheme = "grid"'
         )
-
-
-def _field_pod(task: ReductionTask, values: Array, weights: Array) -> Pod:
-    """More modes of a field (n_snapshots, n) than are kept."""
-    return compute_pod(values, weights, FINER * task.options.tolerance, MORE_MODES * task.options.max_modes)
 
 
 def _slopes(snapshots: list[Snapshot], name: str, pod: Pod, kept: Truncation) -> Array | None:
@@ -175,18 +169,9 @@ def _fitted(task: ReductionTask, coefficients: Array, slopes: Array | None) -> t
         "cross_validation": {str(degree): error for degree, error in errors.items()},
     }
     if options.format == "tensor_train":
-        return _train(functions, SHARE * options.tolerance), summary
+        indices, tolerance = functions.multi_indices, SHARE * options.tolerance
+        return chebyshev_train(lower, upper, indices, functions.coefficients, tolerance), summary
     return functions, summary
-
-
-def _train(functions: ParameterFunctions, tolerance: float) -> Functions:
-    """The same polynomials as a tensor train."""
-    degrees = functions.multi_indices.max(axis=0)
-    bases = tuple(
-        chebyshev_basis(lower, upper, int(degree))
-        for lower, upper, degree in zip(functions.lower, functions.upper, degrees, strict=True)
-    )
-    return expansion_train(functions.multi_indices, functions.coefficients, bases, tolerance)
 
 
 def _offered_functions(dimension: int) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,15 +110,7 @@ class _Regression:
         #: Each parameter's degree must be below its number (d,) here.
         self.degrees = self._conditions * self._levels
 
-    def total_degree(self, degree: int) -> NDArray[np.int64]:
-        """The multi-indices (n_terms, d) of a total degree that the samples determine."""
-        return self._known(total_degree_indices(len(self.degrees), degree))
-
-    def weighted_degree(self, degrees: Sequence[int]) -> NDArray[np.int64]:
-        """The multi-indices (n_terms, d) of degrees of the parameters that the samples determine."""
-        return self._known(weighted_degree_indices(degrees))
-
-    def _known(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    def determined(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those (m, d) of multi-indices (n_terms, d) that a full grid of the samples' levels determines.
 
         Let w_k be the polynomial that is zero at the n_k levels of parameter k. Polynomials that are zero at the grid
@@ -200,7 +191,7 @@ def fit_functions(
     best: _Trial | None = None
     terms = 0
     for degree in range(min(2, max_degree), max_degree + 1):
-        indices = fit.total_degree(degree)
+        indices = fit.determined(total_degree_indices(d, degree))
         if not fit.suits(indices) or len(indices) == terms:
             break
         terms = len(indices)
@@ -222,7 +213,7 @@ def _raised(fit: _Regression, best: _Trial, highest: int) -> _Trial:
     for k in range(len(degrees)):
         while degrees[k] < most[k]:
             tried = [*degrees[:k], min(max(3 * degrees[k] // 2, 2), most[k]), *degrees[k + 1 :]]
-            indices = fit.weighted_degree(tried)
+            indices = fit.determined(weighted_degree_indices(tried))
             if len(indices) > MOST_TERMS or not fit.suits(indices):
                 break
             trial = fit.trial(indices)

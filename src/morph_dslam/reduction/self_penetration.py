@@ -53,8 +53,8 @@ def penetration_report(
         return None
     surface, states = SurfaceContact(mesh.nodes, mesh.triangles), []
     for solution in solutions:
-        found = surface.find(mesh.nodes + solution.fields["displacement"])
-        states += _deep(mesh, solution, found.depths)
+        _, depths = surface.find(mesh.nodes + solution.fields["displacement"])
+        states += _deep(mesh, solution, depths)
     return _report(
         parameters,
         len(solutions),
@@ -225,20 +225,6 @@ def _report(
     return {"statement": statement, "checked": checked, "states": states}
 
 
-@dataclass(frozen=True)
-class SelfPenetration:
-    """Nodes of a surface that lie inside another part of the solid.
-
-    Attributes
-    ----------
-    nodes : (k,) their indices.
-    depths : (k,) how far each is from the nearest part of the surface that faces it, m.
-    """
-
-    nodes: NDArray[np.int64]
-    depths: Array
-
-
 class SurfaceContact:
     """Finds where a closed surface passes through itself.
 
@@ -252,8 +238,11 @@ class SurfaceContact:
         self._undeformed, self._triangles = np.asarray(nodes, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
         self._on_surface = np.unique(triangles)
 
-    def find(self, deformed: Array) -> SelfPenetration:
-        """The nodes that lie inside another part of the solid, of nodes (n, 3) where they are now, m."""
+    def find(self, deformed: Array) -> tuple[NDArray[np.int64], Array]:
+        """The nodes (k,) that lie inside another part of the solid, of nodes (n, 3) where they are now, m.
+
+        With each how far it is from the nearest part of the surface that faces it, (k,), m.
+        """
         deformed = np.ascontiguousarray(deformed, dtype=np.float64)
         normals, longest = _normals(deformed, self._triangles), _longest_side(deformed, self._triangles)
         asked = self._touching(deformed, normals, longest)
@@ -267,7 +256,7 @@ class SurfaceContact:
             # Deeper ones are beside those found.
             asked = np.unique(self._triangles[np.isin(self._triangles, asked[found]).any(axis=1)])
             asked = asked[~known[asked]]
-        return SelfPenetration(inside, depths)
+        return inside, depths
 
     def _touching(self, deformed: Array, normals: Array, longest: float) -> NDArray[np.int64]:
         """Nodes that have come near to others that face them, and may have passed them."""

@@ -117,6 +117,15 @@ def polynomial_functions(box: Array, indices: Indices, coefficients: Array) -> P
     return ParameterFunctions(box[:, 0].copy(), box[:, 1].copy(), indices, np.ascontiguousarray(coefficients))
 
 
+def chebyshev_train(
+    lower: Array, upper: Array, indices: Indices, coefficients: Array, tolerance: float
+) -> TensorTrainFunctions:
+    """`expansion_train` of Chebyshev polynomials between ``lower`` and ``upper`` (d,)."""
+    degrees = indices.max(axis=0).tolist()
+    bases = tuple(chebyshev_basis(*each) for each in zip(lower, upper, degrees, strict=True))
+    return expansion_train(indices, coefficients, bases, tolerance)
+
+
 def expansion_train(
     indices: Indices, coefficients: Array, bases: tuple[Basis, ...], tolerance: float
 ) -> TensorTrainFunctions:
