@@ -42,7 +42,7 @@ _MODULES = {
     "export": "io.export",
     "load_camera": "io.camera_files",
     "load_model": "model",
-    "load_registration": "registration.registration",
+    "load_registration": "registration.registration_file",
     "load_run": "evaluation.run_folder",
     "load_scene": "slam.scene",
     "load_study": "studies.study",
@@ -84,10 +84,8 @@ if TYPE_CHECKING:  # the same for editors and type checkers
     from morph_dslam.registration.board_registration import register_board as register_board
     from morph_dslam.registration.landmarks import register_landmarks as register_landmarks
     from morph_dslam.registration.register import register as register
-    from morph_dslam.registration.registration import (
-        Registration as Registration,
-        load_registration as load_registration,
-    )
+    from morph_dslam.registration.registration import Registration as Registration
+    from morph_dslam.registration.registration_file import load_registration as load_registration
     from morph_dslam.render.simulation import SimulatedSequence as SimulatedSequence, simulate as simulate
     from morph_dslam.slam.options import SlamOptions as SlamOptions
     from morph_dslam.slam.scene import Scene as Scene, load_scene as load_scene, map_scene as map_scene

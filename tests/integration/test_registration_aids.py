@@ -21,7 +21,7 @@ from morph_dslam.registration.guess import GuessFile, GuessInitializer
 from morph_dslam.registration.initialization import InitializerFiles
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, AssumedUndeformed
 from morph_dslam.registration.picture import PictureInitializer, load_picture
-from morph_dslam.registration.registration import load_registration
+from morph_dslam.registration.registration_file import load_registration
 from morph_dslam.slam.map_files import save_map
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.estimator import Estimator

@@ -23,7 +23,7 @@ from morph_dslam.registration.messages import (
     PoorFit,
     Underdetermined,
 )
-from morph_dslam.registration.registration import load_registration
+from morph_dslam.registration.registration_file import load_registration
 from morph_dslam.registration.starts import shape_starts, solve_pnp
 from morph_dslam.sources import Frame
 from morph_dslam.studies.rigid import build_rigid

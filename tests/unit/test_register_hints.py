@@ -13,7 +13,8 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.registration import register as register_module
 from morph_dslam.registration.register import register, run_registration
-from morph_dslam.registration.registration import Registration, load_registration
+from morph_dslam.registration.registration import Registration
+from morph_dslam.registration.registration_file import load_registration
 from morph_dslam.slam.rigid_map import Keyframe, RigidMap
 from morph_dslam.slam.scene import Scene
 from morph_dslam.tracking.state import State

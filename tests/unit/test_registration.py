@@ -37,9 +37,9 @@ from morph_dslam.registration.registration import (
     MapRegistration,
     Registration,
     Rival,
-    load_registration,
     registration_in_map,
 )
+from morph_dslam.registration.registration_file import load_registration
 from morph_dslam.registration.scene import View, views_apart
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap

@@ -40,10 +40,9 @@ from morph_dslam.registration.registration import (
     KeyframePose,
     MapRegistration,
     Registration,
-    load_registration,
-    read_content,
     registration_in_map,
 )
+from morph_dslam.registration.registration_file import load_registration, read_content
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, views_apart, views_of
 from morph_dslam.registration.symmetry import turn_warning
 from morph_dslam.render.overlay import draw_overlay

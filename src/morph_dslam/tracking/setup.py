@@ -19,7 +19,8 @@ from morph_dslam.model.inner_structure import InnerStructure, load_inner_structu
 from morph_dslam.notices import Remark
 from morph_dslam.registration.initialization import Initializer, register_by_initializer
 from morph_dslam.registration.landmarks import CLICK_PX, register_landmarks
-from morph_dslam.registration.registration import Registration, in_scene, load_registration, read_content
+from morph_dslam.registration.registration import Registration, in_scene
+from morph_dslam.registration.registration_file import load_registration, read_content
 from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.slam.scene import Scene, load_scene
 from morph_dslam.sources import Frame
