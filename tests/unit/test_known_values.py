@@ -7,12 +7,14 @@ import pytest
 
 from morph_dslam.errors import ArgumentError, TrackingError
 from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
 from morph_dslam.tracking.known_values import KnownValues, registered_with
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
-from tests.support.rendered_sequence import CAMERA, UPRIGHT
+from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, sheet_state, write_recording
+from tests.support.tracked_rig import placed_objects
 
 MODEL = bent_sheet_model(22, 16)
 POSE = RigidTransform(rotation_exp(np.array([0.3, -0.2, 0.0])) @ UPRIGHT, np.array([0.0, 0.0, 0.6]))
@@ -152,3 +154,28 @@ def test_values_of_no_tracked_frame_are_named(tmp_path):
     (text,) = known.remarks([3, 4, 5])
     assert text == "--known told nothing: its values are of frames 100 to 120, and frames 3 to 5 were tracked"
     assert known.remarks([99, 100]) == []
+
+
+@pytest.mark.parametrize(("named", "first", "begins_there"), [(None, 4, True), (4, 4, True), (6, 6, False)])
+def test_a_sensors_value_of_the_reference_frame_counts_whether_the_frame_is_named_or_not(
+    tmp_path, named, first, begins_there
+):
+    """Nine landmarks, a pixel off, leave the arch open; the sensor has it to 0.6 mm."""
+    film, states = SheetFilm(MODEL), {number: sheet_state(0.05 * number) for number in (4, 5, 6)}
+    write_recording(tmp_path, {number: film.frame(state) for number, state in states.items()}, MODEL)
+    rng, state = np.random.default_rng(5), states[first]
+    nodes = rng.choice(len(MODEL.nodes), 9, replace=False)
+    pixels = CAMERA.project(state.camera_from_object.apply(MODEL.positions(state.parameters)[nodes]))
+    save_landmarks(tmp_path / "landmarks.csv", Landmarks(MODEL.nodes[nodes], pixels + rng.standard_normal((9, 2))))
+    rows = [f"{number},{1e3 * state.parameters[0]:.6f}" for number, state in states.items()]
+    (placed,) = placed_objects(
+        frames=tmp_path / "frames",
+        camera=tmp_path / "camera.yaml",
+        model=tmp_path / "sheet.morph",
+        landmarks=tmp_path / "landmarks.csv",
+        known=write(tmp_path, "frame,arch_mm", *rows),
+        reference_frame=named,
+    )
+    assert (placed.frame, placed.in_sequence) == (first, begins_there)
+    assert np.sqrt(placed.registration.covariance[0, 0]) > 10.0 * 0.6e-3
+    assert placed.new_tracker().state.parameters[0] == pytest.approx(state.parameters[0], abs=3.0 * 0.6e-3)

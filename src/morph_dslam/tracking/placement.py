@@ -130,7 +130,7 @@ class PlacedObject:
         """A tracker at its beginning; raises RegistrationError if the object shows too few corners."""
         seen = self.seen or (None,) * len(self.cameras)
         registration, told = self.registration, self.object.known
-        if told is not None and self.in_sequence:
+        if told is not None and not self.is_by_keyframe:  # a keyframe may be of another recording than the table
             registration = registered_with(registration, told, self.frame)
         if len(self.cameras) > 1:
             tracker = RigTracker(
@@ -214,12 +214,17 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     camera.check_image(frames[0].image, where)
     registration, images = part.register(cameras, frames[0]), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
-    in_sequence = not run.live and number in (None, run.first)
+    in_sequence = not run.live and number in (None, _first_number(run))
     placed = with_loads(registration, part.options)
     depth, scale = frames[0].depth if part.options.use_depth else None, registration.depth_scale
     if depth is not None and scale is not None:
         depth = scale.corrected(depth)
     return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence, depth=depth)
+
+
+def _first_number(run: TrackOptions) -> int:
+    """Number of the frame that a recording is tracked from."""
+    return frame_at(run.frames, None).index if run.first is None else run.first
 
 
 def with_loads(registration: Registration, options: TrackerOptions) -> Registration:
