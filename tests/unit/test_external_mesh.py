@@ -1,5 +1,8 @@
 """Meshes in files of other programs, against the boxes that they were written from."""
 
+import base64
+import re
+
 import meshio
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.generators import block
 from morph_dslam.meshing.mesh_checks import check_mesh
+from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.studies.external_mesh import mesh_of
 from morph_dslam.studies.solution_files import read_solution
 from tests.support.meshes import cell_volumes
@@ -64,3 +68,43 @@ def test_cells_that_cannot_be_read_are_refused_and_points_alone_are_read(tmp_pat
         read_solution(path)
     if number == 11:
         assert read_solution(path, whole=False).points == pytest.approx(mesh.nodes)
+
+
+def write_with_types(path, kind, types):
+    """Two hexahedra side by side, with other numbers in the place of VTK's number 12 of their type."""
+    mesh = block(SIZE, (1, 1, 2), "hex8")
+    content = meshio.Mesh(1e3 * mesh.nodes, [("hexahedron", mesh.blocks[0].connectivity)])
+    number = np.array(types, dtype=">i4" if "vtk" in kind else "<i8")
+    if kind == "ascii vtu":
+        meshio.vtu.write(path, content, binary=False)
+        old, new = rb'(Name="types"[^>]*>)[\s\d]*', " ".join(map(str, types)).encode()
+    elif kind == "vtu":
+        meshio.vtu.write(path, content, compression=None)
+        coded = base64.b64encode(np.uint32(number.nbytes).tobytes() + number.tobytes())
+        old, new = rb'(Name="types"[^>]*>)[^<]*', coded
+    else:
+        meshio.vtk.write(path, content, fmt_version="5.1", binary=kind == "vtk")
+        old = rb"(CELL_TYPES 2\n)" + (rb"[\d ]*\n12" if kind == "ascii vtk" else rb".{8}")
+        new = b" ".join(str(each).encode() for each in types) if kind == "ascii vtk" else number.tobytes()
+    text, count = re.subn(old, lambda found: found[1] + new, path.read_bytes(), flags=re.DOTALL)
+    assert count == 1
+    path.write_bytes(text)
+
+
+@pytest.mark.parametrize("kind", ["vtu", "ascii vtu", "vtk", "ascii vtk"])
+@pytest.mark.parametrize("columns", [20, 26, 50, 200])
+def test_voxels_are_refused_and_polylines_left_out_at_every_width_of_the_terminal(
+    tmp_path, monkeypatch, capfd, kind, columns
+):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    path = tmp_path / f"solution.{kind[-3:]}"
+    write_with_types(path, kind, [12, 11])
+    with pytest.raises(StudyError, match="cells that are not known"):
+        read_solution(path)
+    with pytest.raises(StudyError, match="cells that are not known"):
+        load_mesh(path, "mm")
+    write_with_types(path, kind, [12, 4])
+    capfd.readouterr()  # meshio warns of text files that it writes
+    for mesh in (mesh_of(read_solution(path), "mm", path), load_mesh(path, "mm")):
+        assert cell_volumes(mesh) == pytest.approx([np.prod(SIZE) / 2])
+    assert not any(capfd.readouterr())

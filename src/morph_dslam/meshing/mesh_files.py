@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
+from morph_dslam.meshing.left_out_cells import leaves_out_cells
 from morph_dslam.meshing.mesh_checks import check_corners
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_found_surfaces
@@ -215,8 +216,9 @@ def _read(path: Path) -> Any:
     try:
         if kind == ".msh":
             _check_gmsh(path)
-        with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
             content = readers[kind](str(path))
+        lacks_cells = leaves_out_cells(path, content)
     except OSError as error:
         raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except StudyError:
@@ -234,7 +236,7 @@ def _read(path: Path) -> Any:
         raise _damaged(path, error) from error
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
         raise _damaged(path, error) from error
-    if "cannot handle" in warnings.getvalue():  # meshio leaves out cells that it does not know, such as voxels
+    if lacks_cells:  # voxels, say
         raise StudyError(f"{path} holds cells that are not known; use {', '.join(_CELLS)}")
     return content
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
+from morph_dslam.meshing.left_out_cells import leaves_out_cells
 
 Array = NDArray[np.float64]
 #: Of meshio, by what the file is: `meshio.read` itself ends the program where a file is damaged.
@@ -25,7 +26,7 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
     """A file's mesh and point data; of an XDMF series those of one step.
 
     Raises StudyError if it is missing, damaged or of another kind, the step is no number from 0 on, or, where it must
-    be ``whole``, it has cells that meshio does not know and leaves out, such as voxels.
+    be ``whole``, it has cells that meshio does not know and leaves out, such as voxels; polylines beside solids may be.
     """
     if step is not None and not step.isdecimal():
         raise StudyError(f"step '{step}' of {path} is no whole number from 0 on")
@@ -34,9 +35,9 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
         raise StudyError(f"{path} is no solution that can be read; use {', '.join(_READERS)}")
     try:
         if step is None:
-            with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as warnings:
+            with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
                 content = read(str(path))
-            if whole and "cannot handle" in warnings.getvalue():
+            if whole and leaves_out_cells(path, content):
                 raise StudyError(f"{path} holds cells that are not known, such as voxels: save them as hexahedra")
             return content
         with meshio.xdmf.TimeSeriesReader(path) as reader:
