@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,16 +12,20 @@ import meshio
 import numpy as np
 import pytest
 
-from morph_dslam.errors import ExportError, SceneError, TrackingError
+from morph_dslam.errors import ExportError, MapError, RegistrationError, SceneError, SourceError, TrackingError
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.export import export
 from morph_dslam.io.folders import clear_run_folder, make_run_folder
 from morph_dslam.io.state_choice import StateChoice
 from morph_dslam.model import save_model
 from morph_dslam.model.inner_structure import save_inner_structure
+from morph_dslam.registration.register import run_registration
 from morph_dslam.render.simulation import simulate
+from morph_dslam.slam.run import run_slam
 from morph_dslam.sources import Frame
 from morph_dslam.studies.inner_structures import read_inner_structure
 from morph_dslam.tracking.run_folder import RunFolder
+from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
 from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.sinks import TrackedFrame
 from tests.support.bent_sheet import bent_sheet_model
@@ -85,6 +91,80 @@ def test_files_with_the_names_of_a_run_are_not_replaced(tmp_path: Path) -> None:
         make_run_folder(tmp_path, False)
     make_run_folder(tmp_path, True)
     make_run_folder(tmp_path, False, "slam")  # which writes none
+
+
+@pytest.fixture
+def a_film(tmp_path: Path) -> Path:
+    """A folder with a camera file and a recording of one image, in which nothing is seen."""
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames" / "000000.png"), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    save_camera(tmp_path / "lens.yaml", CAMERA)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "refine"), [("tracked.mp4", ()), ("camera.yaml", ("focal",))])
+def test_mapping_replaces_no_files_of_others(name: str, refine, a_film: Path) -> None:
+    out = a_film / "out"
+    (out / "plots").mkdir(parents=True)
+    (out / name).write_text("mine")
+    with pytest.raises(TrackingError):
+        run_slam(a_film / "frames", a_film / "lens.yaml", out, refine=refine, progress=False)
+    (out / name).rename(out / "plots" / "frames.png")
+    with pytest.raises(TrackingError):
+        run_slam(a_film / "frames", a_film / "lens.yaml", out, progress=False)
+    assert contents(out) == {"plots/frames.png": b"mine"}
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_tracking_replaces_no_video_of_others(live: bool, tmp_path: Path) -> None:
+    options = TrackOptions(
+        frames=tmp_path / "film.mp4", model=tmp_path / "m", camera=tmp_path / "c", output=tmp_path, live=live,
+        others=(("knob", ObjectOptions(model=tmp_path / "k")),),
+    )  # fmt: skip
+    (tmp_path / "augmented.mp4").write_text("mine")
+    refused = []
+    for more in (*options.shown_in_folders, *replace(options, video=False).shown_in_folders):
+        try:
+            make_run_folder(tmp_path, False, more=more)
+        except TrackingError:
+            refused.append(True)
+        else:
+            refused.append(False)
+    # The object itself, the one beside it, and both without a video: a live run has one video of all.
+    assert refused == [True, not live, False, False]
+
+
+def test_mapping_does_not_replace_its_source_or_its_camera(a_film: Path) -> None:
+    """Each is refused only if it would be gone: a camera file beside a run that made none stays."""
+    run = a_film / "run"
+    (run / "colmap").mkdir(parents=True)
+    for name in ("camera.yaml", "colmap/cameras.yaml"):
+        shutil.copy(a_film / "lens.yaml", run / name)
+    for name in ("tracked.mp4", "map.h5"):
+        (run / name).write_text("")
+    before = contents(a_film)
+
+    def raised(source: str, camera: str, **choices) -> type[Exception]:
+        with pytest.raises((MapError, SourceError)) as error:
+            run_slam(a_film / source, a_film / camera, run, progress=False, **choices)
+        return error.type
+
+    assert raised("run/tracked.mp4", "lens.yaml") is MapError
+    assert raised("run/tracked.mp4", "lens.yaml", overwrite=True, video=False) is MapError
+    assert raised("gone.mp4", "run/colmap/cameras.yaml", overwrite=True) is MapError
+    for facts, expected in (({}, SourceError), ({"refined_camera": {}}, MapError)):
+        (run / "summary.json").write_text(json.dumps(facts))
+        assert raised("gone.mp4", "run/camera.yaml", overwrite=True) is expected
+    (run / "summary.json").unlink()
+    assert contents(a_film) == before
+
+
+def test_a_registration_does_not_replace_the_one_beside_it(tmp_path: Path) -> None:
+    beside = tmp_path / "registration.json"
+    beside.write_text("mine")
+    with pytest.raises(RegistrationError, match="is an input of this command"):
+        run_registration("map.h5", "block.morph", "camera.yaml", tmp_path, beside=[beside], overwrite=True)
+    assert contents(tmp_path) == {"registration.json": b"mine"}
 
 
 def test_the_video_of_an_earlier_map_goes_with_it(tmp_path: Path) -> None:
@@ -190,19 +270,45 @@ def test_a_simulation_replaces_one_that_was_not_finished(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(
     ("file_format", "name"),
-    [("xdmf", "block.h5"), ("xdmf", "states.csv"), ("vtu", "states.csv"), ("gltf", "block.glb")],
+    [
+        *(("xdmf", "block.h5"), ("xdmf", "states.csv"), ("vtu", "states.csv"), ("gltf", "block.glb")),
+        *(("vtu", "block_0001.vtu"), ("vtu", "block_inner_left-lobe_0001.vtu")),
+    ],
 )
 def test_an_export_replaces_no_files_of_others(file_format, name: str, with_inputs: Path) -> None:
     folder = with_inputs / "out"
     folder.mkdir()
     (folder / name).write_text("mine")
+    structure = read_inner_structure(stretched_block_model(), "left-lobe", with_inputs / "ball.stl", "m")
+    save_inner_structure(with_inputs / "inner.h5", structure)
+    inner = [with_inputs / "inner.h5"] if file_format == "vtu" else []
     for _ in range(2):
         with pytest.raises(ExportError, match="no earlier export has written it"):
-            export(with_inputs / "block.morph", folder, file_format, np.zeros((2, 2)))
+            export(with_inputs / "block.morph", folder, file_format, np.zeros((2, 2)), inner=inner)
     assert contents(folder) == {name: b"mine"}
     (folder / name).unlink()
     for _ in range(2):
-        export(with_inputs / "block.morph", folder, file_format, np.zeros((2, 2)))
+        export(with_inputs / "block.morph", folder, file_format, np.zeros((2, 2)), inner=inner)
+
+
+@pytest.mark.parametrize(("file_format", "last"), [("vtu", "block_0002.vtu"), ("xdmf", "block.h5")])
+def test_an_export_that_was_killed_is_known_as_one(file_format, last: str, with_inputs: Path, monkeypatch) -> None:
+    folder = with_inputs / "out"
+
+    def killed(*_) -> None:
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        if file_format == "vtu":
+            whole = meshio.Mesh.write
+            patch.setattr(meshio.Mesh, "write", lambda mesh, p: killed() if p.name == last else whole(mesh, p))
+        else:
+            patch.setattr(meshio.xdmf.time_series, "write_xml", killed)
+        with pytest.raises(SystemExit):
+            export(with_inputs / "block.morph", folder, file_format, np.zeros((4, 2)))
+    assert (last in contents(folder)) == (file_format == "xdmf")
+    export(with_inputs / "block.morph", folder, "vtu", np.zeros((1, 2)))
+    assert contents(folder).keys() == {"block_0000.vtu", "block.pvd", "states.csv"}
 
 
 def test_an_export_does_not_replace_the_table_of_its_states(with_inputs: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
+import h5py
 import meshio
 import numpy as np
 from meshio.xdmf import TimeSeriesWriter
@@ -140,29 +141,65 @@ def _earlier_export(folder: Path, stem: str) -> list[Path]:
     written = [folder / unescape(name) for name in re.findall(own, _beginning(collection))]
     found = [*written, collection] if written else []
     head = _beginning(series, _HEAD)
+    data = series.with_suffix(".h5")
     if _XDMF_SERIES in head and f">{escape(stem)}.h5:/" in head:
-        found += [series, series.with_suffix(".h5")]
+        found += [series, data]
+    elif _is_own_data(data):  # of a series that was not written to its end
+        found.append(data)
     if _GLB_GENERATOR in _beginning(animation, _HEAD):
         found.append(animation)
     return [*found, folder / "states.csv"] if found else []
 
 
-def _make_way(folder: Path, stem: str, file_format: FileFormat, inputs: Sequence[str | Path | None]) -> None:
+def _is_own_data(path: Path) -> bool:
+    """Whether the data of an XDMF series are there, and an export has written them."""
+    if not path.is_file():
+        return False
+    try:
+        with h5py.File(path) as file:
+            return file.attrs.get("generator") == GENERATOR
+    except OSError:  # it is no HDF5 file
+        return False
+
+
+def _names_of_export(stem: str, file_format: FileFormat, states: States) -> list[str]:
+    """Names of all files that an export writes."""
+    if file_format == "gltf":
+        return ["states.csv", f"{stem}.glb"]
+    if file_format == "xdmf":
+        return ["states.csv", f"{stem}.xdmf", f"{stem}.h5"]
+    of_states = [name for state in range(len(states)) for name in _vtu_names(stem, states, state)]
+    return ["states.csv", f"{stem}.pvd", *of_states]
+
+
+def _vtu_names(stem: str, states: States, state: int) -> list[str]:
+    """Names of the files of a state: the object's, and those of the structures inside."""
+    inner = (f"{stem}_{_INNER}{_file_name(structure.name)}_{state:04d}.vtu" for structure in states.inner)
+    return [f"{stem}_{state:04d}.vtu", *inner]
+
+
+def _make_way(folder: Path, stem: str, names: Sequence[str], inputs: Sequence[str | Path | None]) -> None:
     """Remove the export of this name that is there, which would pass for states of the next.
+
+    Parameters
+    ----------
+    folder, stem : of the next.
+    names : of the files that it writes.
+    inputs : files that it reads; None for what is not given.
 
     Raises
     ------
     ExportError
         If what is to be written would take the place of a file that no export has written, or of an input.
     """
-    endings = {"xdmf": ("xdmf", "h5"), "vtu": ("pvd",), "gltf": ("glb",)}[file_format]
-    targets = [folder / "states.csv", *(folder / f"{stem}.{ending}" for ending in endings)]
-    stems = {path.stem for ending in ("xdmf", "pvd", "glb") for path in folder.glob(f"*.{ending}")}
+    targets = [folder / name for name in names]
+    stems = {stem, *(path.stem for ending in ("xdmf", "pvd", "glb") for path in folder.glob(f"*.{ending}"))}
     of_exports = {name: _earlier_export(folder, name) for name in stems}
-    earlier = of_exports.get(stem, [])
+    earlier = of_exports[stem]
     check_no_input([*targets, *earlier], inputs, ExportError)
+    own = {path for files in of_exports.values() for path in files}
     for path in targets:
-        if path.exists() and all(path not in files for files in of_exports.values()):
+        if path.exists() and path not in own:
             raise ExportError(f"{path} is there, and no earlier export has written it: name another folder")
     for path in earlier:
         path.unlink(missing_ok=True)
@@ -183,28 +220,35 @@ def write_vtu_series(folder: Path, stem: str, states: States) -> Path:
 
     An interrupt ends the series behind the state that is being written.
     """
-    root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
-    collection = ElementTree.SubElement(root, "Collection")
     cells, places, series = _cells(states.model), [], folder / f"{stem}.pvd"
     with WaitingInterrupts() as interrupts:
+        # By it the next export knows the files of one that was not written to its end.
+        _write_collection(series, stem, states, len(states))
         for i in tqdm(range(len(states)), desc="states", unit="file"):
-            name = f"{stem}_{i:04d}.vtu"
+            names = _vtu_names(stem, states, i)
             nodes, fields = fields_of_state(states, i)
-            meshio.Mesh(nodes, cells, point_data=fields).write(folder / name)
-            parts = [name]
-            for structure in states.inner:
-                parts.append(f"{stem}_{_INNER}{_file_name(structure.name)}_{i:04d}.vtu")
-                _inner_mesh(states, structure, i).write(folder / parts[-1])
-            for part, file in enumerate(parts):
-                of_part = {"timestep": f"{states.times[i]:.15g}", "part": str(part), "file": file}
-                ElementTree.SubElement(collection, "DataSet", of_part)
-            places.append({"file": name})
+            meshes = [meshio.Mesh(nodes, cells, point_data=fields)]
+            meshes += [_inner_mesh(states, structure, i) for structure in states.inner]
+            for name, mesh in zip(names, meshes, strict=True):
+                mesh.write(folder / name)
+            places.append({"file": names[0]})
             if interrupts.is_waiting:
                 break
         write_table(folder / "states.csv", states, places)
-        ElementTree.indent(root)
-        ElementTree.ElementTree(root).write(series, xml_declaration=True, encoding="utf-8")
+        _write_collection(series, stem, states, len(places))
     return series
+
+
+def _write_collection(path: Path, stem: str, states: States, n_states: int) -> None:
+    """Write the .pvd that names the files of the first states."""
+    root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    collection = ElementTree.SubElement(root, "Collection")
+    for i in range(n_states):
+        for part, name in enumerate(_vtu_names(stem, states, i)):
+            of_part = {"timestep": f"{states.times[i]:.15g}", "part": str(part), "file": name}
+            ElementTree.SubElement(collection, "DataSet", of_part)
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(path, xml_declaration=True, encoding="utf-8")
 
 
 class _SeriesWriter(TimeSeriesWriter):
@@ -217,6 +261,7 @@ class _SeriesWriter(TimeSeriesWriter):
         data = self.filename.with_suffix(".h5")
         self._written = written_hdf5(data)
         self.h5_filename, self.h5_file = str(data), self._written.__enter__()
+        self.h5_file.attrs["generator"] = GENERATOR
         return self
 
     def __exit__(
@@ -312,7 +357,8 @@ def export(
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _make_way(folder, stem, file_format, [choice.path if isinstance(choice, StateChoice) else None, *inner])
+        read = [choice.path if isinstance(choice, StateChoice) else None, *inner]
+        _make_way(folder, stem, _names_of_export(stem, file_format, states), read)
         if file_format == "gltf":
             target = _write_animation(folder, stem, states, show)
         else:

@@ -36,8 +36,14 @@ def check_free(folder: Path, names: Sequence[str], held: str, overwrite: bool, k
 Command = Literal["track", "slam"]
 #: What each run writes, by the command; the first one is the file by which such a run is known.
 _WRITTEN: dict[Command, tuple[str, ...]] = {
-    "track": ("result.h5", "frames.csv", "trajectory.txt", "camera.yaml", "model.morph", "summary.json"),
-    "slam": ("map.h5", "frames.csv", "trajectory.txt", "map.ply", "summary.json", "colmap"),
+    "track": (
+        *("result.h5", "frames.csv", "trajectory.txt", "camera.yaml", "model.morph", "summary.json"),
+        *("plots/residual.png", "plots/timings.png"),
+    ),
+    "slam": (
+        *("map.h5", "frames.csv", "trajectory.txt", "map.ply", "summary.json", "colmap"),
+        *("plots/trajectory.png", "plots/frames.png"),
+    ),
 }
 #: What not every run and evaluation writes into its folder, or not under the same names, and reports show.
 _OF_ONE_RUN: dict[Command, tuple[str, ...]] = {
@@ -49,11 +55,12 @@ _OF_ONE_RUN: dict[Command, tuple[str, ...]] = {
 }
 
 
-def _holds_run(folder: Path, command: Command) -> bool:
+def holds_run(folder: Path, command: Command) -> bool:
+    """Whether a folder has a run of a command."""
     return (folder / _WRITTEN[command][0]).exists()
 
 
-def make_run_folder(folder: Path, overwrite: bool, command: Command = "track") -> None:
+def make_run_folder(folder: Path, overwrite: bool, command: Command = "track", more: Sequence[str] = ()) -> None:
     """Make a run folder and those above it.
 
     Parameters
@@ -61,6 +68,7 @@ def make_run_folder(folder: Path, overwrite: bool, command: Command = "track") -
     folder : to make.
     overwrite : whether it may hold a run already, and files called as those of a run.
     command : that writes the run.
+    more : names of files that this run writes and not every one does, as its video.
 
     Raises
     ------
@@ -68,11 +76,11 @@ def make_run_folder(folder: Path, overwrite: bool, command: Command = "track") -
         If it cannot be made, or holds a run of the other command, or one that is not to be overwritten.
     """
     for other in _WRITTEN:
-        if other != command and _holds_run(folder, other):
+        if other != command and holds_run(folder, other):
             raise TrackingError(
                 f"{folder} holds a run of `morph {other}`, whose files would be gone: choose another one"
             )
-    check_free(folder, _WRITTEN[command], "a run", overwrite, TrackingError)
+    check_free(folder, (*_WRITTEN[command], *more), "a run", overwrite, TrackingError)
     _make(folder)
 
 
@@ -87,7 +95,7 @@ def clear_run_folder(folder: Path, command: Command = "track", more: Sequence[Pa
     command : that writes the new one.
     more : files of the earlier run beside these.
     """
-    if _holds_run(folder, command):
+    if holds_run(folder, command):
         for path in (*_of_one_run(folder, command), *more):
             with suppress(OSError):
                 path.unlink()

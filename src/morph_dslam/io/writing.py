@@ -41,7 +41,7 @@ def check_no_input(outputs: Iterable[Path], inputs: Iterable[str | Path | None],
 
     Parameters
     ----------
-    outputs : files to write, whether they are there or not.
+    outputs : files to write, and folders whose files are written, whether they are there or not.
     inputs : files and folders that are read; None for what is not given.
     kind : of the error.
     """
@@ -49,7 +49,9 @@ def check_no_input(outputs: Iterable[Path], inputs: Iterable[str | Path | None],
     for output in outputs:
         for path in given:
             with suppress(OSError):  # it is not there
-                if path.samefile(output):
+                is_it, is_in_it = path.samefile(output), output.resolve() in path.resolve().parents
+                if is_it or is_in_it:
                     raise kind(
-                        f"{output} is an input of this command, and would be overwritten: write to another place"
+                        f"{path if is_in_it else output} is an input of this command, and would be overwritten: write "
+                        "to another place"
                     )

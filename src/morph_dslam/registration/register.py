@@ -18,6 +18,7 @@ from morph_dslam.geometry import RigidTransform, rotation_log
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.landmarks import Landmarks, load_landmarks
+from morph_dslam.io.writing import check_no_input
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.registration.board_registration import register_board
 from morph_dslam.registration.edges import Sighting
@@ -360,7 +361,7 @@ def run_registration(
     ------
     RegistrationError
         If the object is not found, a file of ``beside`` is not one of this map, or the folder cannot be
-        written, or holds a registration that is not to be replaced.
+        written, or holds a registration that is not to be replaced, or an input that would be.
     MapError, ModelFileError, CameraError
         If an input cannot be read.
     """
@@ -372,6 +373,8 @@ def run_registration(
     if board is not None and (beside or any(hint is not None for hint in hints.values())):
         raise RegistrationError("a board says where the object is: leave out --beside and the hints")
     names = ("registration.json", "registration.jpg")
+    given = [map_path, model_path, str(camera_path).partition("#")[0], *beside, board, landmarks, guess]
+    check_no_input([output / name for name in names], given, RegistrationError)
     check_free(output, names, "a registration", overwrite, RegistrationError)
     camera, model = load_camera(camera_path), load_model(model_path)
     others = [_load_beside(path, map_path) for path in beside]

@@ -14,7 +14,7 @@ from morph_dslam.camera import Camera, StereoCamera
 from morph_dslam.errors import MapError, SourceError
 from morph_dslam.io.camera_files import load_camera_or_pair, save_camera
 from morph_dslam.io.colmap import ColmapModel, read_colmap_model
-from morph_dslam.io.folders import clear_run_folder, make_run_folder, only_writer, replaced_files
+from morph_dslam.io.folders import clear_run_folder, holds_run, make_run_folder, only_writer, replaced_files
 from morph_dslam.io.trajectory import Trajectory, load_trajectory
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.io.writing import check_no_input
@@ -28,6 +28,9 @@ from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import FrameSource, FrameStream, open_source, open_stream
 from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream
+
+#: What a run writes if it is asked for it.
+_VIDEO, _CAMERA = "tracked.mp4", "camera.yaml"
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,9 @@ def run_slam(
     start.check(options, refine)
     if depth_per_metre is not None and not options.use_depth:
         raise MapError("--depth-per-metre says how depth images are to be read: leave it or --no-depth out")
-    own_camera = output / "camera.yaml"
-    written = [*replaced_files(output, "slam"), *([own_camera] if refine or overwrite else [])]
+    more_files = [*([_VIDEO] if video else []), *([_CAMERA] if refine else [])]
+    gone = _more_of_run_before(output) if overwrite else []
+    written = [*replaced_files(output, "slam"), *(output / name for name in (*more_files, *gone))]
     grown = map_path if options.extend else None  # it may take its own place
     given = [source, str(camera).partition("#")[0], None if grown else map_path, trajectory, images]
     check_no_input(written, given, MapError)
@@ -133,7 +137,7 @@ def run_slam(
     if depth_per_metre is not None:
         more["inputs"]["depth_per_metre"] = depth_per_metre
     with stream if isinstance(stream, LiveStream) else nullcontext(), only_writer(output):
-        make_run_folder(output, overwrite, "slam")
+        make_run_folder(output, overwrite, "slam", more_files)
         refined: Camera | None = None
         if refine:
             refined, more["refined_camera"] = _refined(stream, one_or_two, refine, options, progress)
@@ -148,10 +152,12 @@ def run_slam(
         again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0
         try:
-            _track(slam, stream, frames, output / "tracked.mp4" if video else None, progress)
+            _track(slam, stream, frames, output / _VIDEO if video else None, progress)
             again = stream if isinstance(stream, FrameSource) and known is None else None
         except MapError:
             frames.clear()  # nothing of a run whose depth contradicts the map may replace an earlier one
+            if video:  # nor be in the way of the next
+                (output / _VIDEO).unlink(missing_ok=True)
             raise
         except SourceError as error:
             if not frames:
@@ -166,23 +172,24 @@ def run_slam(
                 if options.freeze_at is not None and options.freeze_at > frames[-1].index:
                     last = frames[-1].index
                     notes += (f"--freeze-at {options.freeze_at} had no effect: the last frame was {last}",)
-                _clear(output, video)
+                clear_run_folder(output, "slam", [output / name for name in gone if name not in more_files])
                 if refined is not None:
-                    save_camera(own_camera, refined)
+                    save_camera(output / _CAMERA, refined)
                 summary = write_run(output, scene, more, notes)
     return summary
 
 
-def _clear(output: Path, video: bool) -> None:
-    """Delete what the run writes that is overwritten, and this one does not: also its video and its camera file.
+def _more_of_run_before(output: Path) -> list[str]:
+    """Names of what an earlier run in the folder wrote on request, and the next one deletes or replaces.
 
     A camera file in the folder of a run that made none is somebody's own.
     """
-    summary, stale = output / "summary.json", [] if video else [output / "tracked.mp4"]
+    if not holds_run(output, "slam"):
+        return []
     with suppress(OSError, ValueError):
-        if "refined_camera" in json.loads(summary.read_text(encoding="utf-8")):
-            stale.append(output / "camera.yaml")
-    clear_run_folder(output, "slam", stale)
+        if "refined_camera" in json.loads((output / "summary.json").read_text(encoding="utf-8")):
+            return [_VIDEO, _CAMERA]
+    return [_VIDEO]
 
 
 def _refined(

@@ -53,6 +53,7 @@ class RunFolder:
     camera : the first one.
     inner : structures inside of the object.
     overwrite : whether to replace a run that is in the folder.
+    more : names of files that others write into the folder during the run, as the video.
 
     Attributes
     ----------
@@ -72,8 +73,9 @@ class RunFolder:
         camera: Camera,
         inner: Sequence[CarriedStructure] = (),
         overwrite: bool = False,
+        more: Sequence[str] = (),
     ) -> None:
-        make_run_folder(path, overwrite)
+        make_run_folder(path, overwrite, more=more)
         self.path, self.name, self.results, self.overwrite = path, name, results, overwrite
         self._camera, self._inner, self._repeated = camera, inner, RepeatedPictures()
         self._centres = InnerCentres(inner)

@@ -138,6 +138,15 @@ class TrackOptions(ObjectOptions):
         return (self.output, *(self.output / name for name, _ in self.others))
 
     @property
+    def shown_in_folders(self) -> list[tuple[str, ...]]:
+        """Names of the files in each run folder that this run writes and not every one does."""
+        # A live run draws all objects into one video.
+        videos = [
+            ("augmented.mp4",) if self.video and (k == 0 or not self.live) else () for k in range(len(self.folders))
+        ]
+        return [(*video, "latency.csv") if self.live else video for video in videos]
+
+    @property
     def stream_names(self) -> tuple[str, ...]:
         """By which streams call each object: the first one by its model file."""
         others, first = [name for name, _ in self.others], self.model.stem

@@ -240,8 +240,8 @@ class _Job:
         for folder in run.folders:
             stack.enter_context(only_writer(folder))
         self._folders = [
-            RunFolder(folder, part.name, part.new_results(), part.camera, part.inner, run.overwrite)
-            for folder, part in zip(run.folders, placed, strict=True)
+            RunFolder(folder, part.name, part.new_results(), part.camera, part.inner, run.overwrite, more)
+            for folder, part, more in zip(run.folders, placed, run.shown_in_folders, strict=True)
         ]
         sharpens = {part.name: run.live and part.options.pose == "still" for part in placed}
         self._again = {p.name: Sharpening(p) if sharpens[p.name] else Reregistration(p) for p in placed}
