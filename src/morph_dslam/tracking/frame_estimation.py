@@ -119,9 +119,15 @@ class FrameEstimation:
             offsets = np.where(attempt.inliers[:, None], zero_where_unknown(found.recorded - projected), 0.0)
             again = self.correct(picture, state, offsets, attempt.prior)
             if reject(again, self._options) is not None:
+                self.weigh_known(attempt)
                 break
             attempt = again
         return attempt
+
+    def weigh_known(self, attempt: PoseHypothesis) -> None:
+        """Weigh what is known of parameters by an attempt that is kept: others may have been made after it."""
+        if not attempt.outline_alone:
+            self._estimator.known.learn(attempt.estimate.sigma_px)
 
     def _trimmed(
         self, measurement: Measurement, start: State, prior: Prior | None, motion: RowMotion | None = None

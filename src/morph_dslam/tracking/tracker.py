@@ -385,6 +385,7 @@ class Tracker:
     def _refine(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
         """Add outline, depth, what earlier frames tell of per-sequence parameters, and the discrepancy."""
         estimation = self._view.estimation
+        estimation.weigh_known(hypothesis)
         with stage("search"):  # of one that was found otherwise than by `_search`, too
             hypothesis = estimation.in_likelier_tilt(hypothesis)
         with stage("outline"):
