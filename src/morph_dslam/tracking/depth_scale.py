@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.state import BoundPoints, State
 
@@ -35,20 +33,6 @@ class DepthScale:
     def corrected(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """A depth image (h, w), metres, in this scale."""
         return depth if self.factor == 1.0 else depth * np.float32(self.factor)
-
-
-class KnownByDepth(Protocol):
-    """What is known of a state, as residuals into which depths enter."""
-
-    def residuals(self, camera: Camera, state: State) -> Array: ...
-
-    def scaled(self, factor: float) -> Self: ...
-
-
-def scale_slopes(known: KnownByDepth, camera: Camera, state: State) -> Array:
-    """Derivatives (r,) of residuals by all depths together, as a share of each; zero of what no depth enters."""
-    larger, smaller = (known.scaled(factor).residuals(camera, state) for factor in (LARGER, SMALLER))
-    return np.asarray((larger - smaller) / (2.0 * STEP))
 
 
 class CommonDepthScale:

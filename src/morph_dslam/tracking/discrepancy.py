@@ -420,11 +420,10 @@ class _Adjustment:
         return np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
 
     def _frame(self, keyframe: Keyframe) -> _Frame:
-        points, pixels, weights, normals = keyframe.measured(self._points, self._met)
-        state = self._estimator.estimate(points, pixels, weights, keyframe.state, normals).state
+        measured = keyframe.measured(self._points, self._met)
+        points, state = measured.points, self._estimator.fit(measured, keyframe.state).state
         sliding = np.zeros((len(points), 3, 3))
         sliding[: len(self._points)] = self._edges(state) @ self._along
-        measured = Observations(points, pixels, weights, normals, np.zeros((0, 0)))
         influence, values = self._fit.basis.influence(points.rest), np.zeros_like(self.values)
         shape = self._fit.shape(state)
         return _Frame(measured, state, points.in_camera(state), shape, sliding, influence, values)

@@ -379,7 +379,7 @@ class FrameEstimation:
             estimator = self._estimator if last else self._scout
             seen = outline.measure(picture.grey, state, far, picture.occluder_depth, motion=picture.motion)
             for _ in range(2):  # the second time without what does not agree
-                together = Observations(seen.points, seen.pixels, seen.weights, seen.normals, np.zeros((0, 0)))
+                together = Observations(seen.points, seen.pixels, seen.weights, seen.normals)
                 estimate = estimator.fit(together, state, prior)
                 attempt = PoseHypothesis(estimate, np.zeros(0, dtype=bool), nothing, np.zeros(0), prior, seen)
                 state = estimate.state
@@ -425,11 +425,8 @@ class FrameEstimation:
         if ratio is None or not 1.0 / MOST_TIMES < ratio < MOST_TIMES:
             return replace(attempt, depth_unused=DepthNotUsed(ratio))
         attempt = replace(attempt, depths=depths.padded(len(self._reference.all_points)))
-        seen = self.measured(attempt)
-        estimate = self._estimator.estimate(
-            seen.points, seen.pixels, seen.weights, attempt.estimate.state, seen.normals, attempt.prior, attempt.depths
-        )
-        return replace(attempt, estimate=estimate)
+        seen = self.measured(attempt, correlated=False)
+        return replace(attempt, estimate=self._estimator.fit(seen, attempt.estimate.state, attempt.prior))
 
     def with_blur(
         self, picture: Image, attempt: PoseHypothesis, last: State, warped: Callable[[State, Array], Array] | None

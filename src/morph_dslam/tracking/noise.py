@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -30,7 +30,7 @@ class Observations:
     pixels : (p, 2) as measured
     weights : (p,), inverse variances up to a factor.
     normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
-    correlation : (p, p) of the errors of the points' measurements
+    correlation : (p, p) of the errors of the points' measurements; empty where nobody asks for it.
     depths : where a depth camera saw them.
     """
 
@@ -38,7 +38,7 @@ class Observations:
     pixels: Array
     weights: Array
     normals: Array
-    correlation: Correlation
+    correlation: Correlation = field(default_factory=lambda: np.zeros((0, 0)))
     depths: PointDepths | None = None
 
     @property

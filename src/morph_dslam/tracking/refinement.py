@@ -20,9 +20,10 @@ from scipy.optimize import OptimizeResult, approx_fprime, least_squares
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.depth import SCALE_STD, PointDepths
-from morph_dslam.tracking.depth_scale import scale_slopes
+from morph_dslam.tracking.depth_scale import LARGER, SMALLER, STEP
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
+from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.outline import OutlineMeasurement
 
 Array = NDArray[np.float64]
@@ -55,25 +56,15 @@ class Keyframe:
     recorded: Array | None = None
     depths: PointDepths | None = None
 
-    def measured(self, points: BoundPoints, met: NDArray[np.bool_]) -> tuple[BoundPoints, Array, Array, Array]:
-        """All that was measured, of ``points`` (those of the reference view that ``met``) and of the outline.
-
-        Returns
-        -------
-        points : p of them
-        pixels : (p, 2)
-        weights : (p,)
-        normals : (p, 2), zero but on the outline.
-        """
+    def measured(self, points: BoundPoints, met: NDArray[np.bool_]) -> Observations:
+        """The pixels of ``points`` (those of the reference view that ``met``) and of the outline."""
         pixels, weights = self.pixels[met], self.weights[met].astype(np.float64)
-        normals = np.zeros_like(pixels)
-        if self.outline is not None:
-            seen = self.outline
+        normals, seen = np.zeros_like(pixels), self.outline
+        if seen is not None:
             points = points.joined(seen.points)
-            pixels = np.concatenate([pixels, seen.pixels])
+            pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, seen.weights])
-            normals = np.concatenate([normals, seen.normals])
-        return points, pixels, weights, normals
+        return Observations(points, pixels, weights, normals)
 
 
 #: How many independent points a keyframe counts for: its residuals are mostly the model's, which are alike
@@ -156,7 +147,9 @@ def refine_reference(
     jacobian = _derivatives(residuals, found.x, n_known)
     rows = np.split(jacobian[n_known:], np.cumsum(_sizes(keyframes, n_points))[:-1]) if keyframes else []
     covariance, refined = np.zeros((d + 6, d + 6)), reference(found.x)
-    by_scale = depth_scale_std * scale_slopes(known, camera, refined)
+    # All depths may be off by one factor; what no depth enters does not move with it.
+    larger, smaller = (known.scaled(factor).residuals(camera, refined) for factor in (LARGER, SMALLER))
+    by_scale = depth_scale_std * ((larger - smaller) / (2.0 * STEP))
     covariance[np.ix_(free, free)] = _covariance(jacobian[:n_known], rows, 2 * n_points, by_scale)
     return refined, covariance * np.outer(scale, scale)
 
@@ -222,8 +215,8 @@ def differences(residuals: Callable[[Array], Array], at: Array, bounds: tuple[Ar
 
 def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool_], frame: Keyframe) -> Array:
     """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
-    points, pixels, weights, normals = frame.measured(points, met)
-    estimate = inner.estimate(points, pixels, weights, frame.state, normals)
+    measured = frame.measured(points, met)
+    estimate, weights = inner.fit(measured, frame.state), measured.weights
     length = np.linalg.norm(estimate.residuals, axis=1)
     huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))
     sigma = max(frame.sigma_px, LEAST_SIGMA_PX)

@@ -20,11 +20,12 @@ from scipy.optimize import OptimizeResult
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.tracking.binding import bind_pixels, view_of
-from morph_dslam.tracking.depth import SCALE_STD, PointDepths
+from morph_dslam.tracking.depth import SCALE_STD
 from morph_dslam.tracking.depth_scale import LARGER, SMALLER
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.levenberg_marquardt import bounded_step
+from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.refinement import (
     DIFFERENCE,
     EFFECTIVE_POINTS,
@@ -258,11 +259,12 @@ class StillProblem:
         for number, recorded in enumerate(self._recorded):
             frame = _with_pixels(recorded, estimator.camera.undistort_pixels)
             of_pixels, of_depths = self._sigmas[number]
-            depths = None if frame.depths is None else frame.depths.take(met)
-            found, left, weights, far = self._fitted(
-                estimator, frame.measured(points, met), depths, state, self._own[number], steps
-            )
-            self._own[number] = found
+            measured, depths = frame.measured(points, met), None
+            if frame.depths is not None:
+                depths = frame.depths.take(met)
+                measured = replace(measured, depths=depths.padded(len(measured.points)))
+            self._own[number], left, far = self._fitted(estimator, measured, state, self._own[number], steps)
+            weights = measured.weights
             huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
             left *= np.sqrt(weights * huber * EFFECTIVE_POINTS / max(weights.sum(), 1.0))[:, None] / of_pixels
             scaled = np.zeros((len(met) + len(left) - n_met, 2))
@@ -281,22 +283,16 @@ class StillProblem:
             self._sigmas[number] = np.maximum(self._sigmas[number] * rms, self._floors[number])
 
     def _fitted(
-        self,
-        estimator: Estimator,
-        measured: tuple[BoundPoints, Array, Array, Array],
-        depths: PointDepths | None,
-        state: State,
-        own: Array,
-        steps: int,
-    ) -> tuple[Array, Array, Array, Array]:
+        self, estimator: Estimator, measured: Observations, state: State, own: Array, steps: int
+    ) -> tuple[Array, Array, Array]:
         """A keyframe at its best in the pose of ``state``, by so many steps at most.
 
         Returns
         -------
-        Its parameters (d,), what they leave (p, 2), weights (p,), and what they leave of depths (p,), all in pixels.
+        Its parameters (d,), and what they leave (p, 2) and of depths (p,), in pixels.
         """
-        points, pixels, weights, normals = measured
-        depths = None if depths is None else depths.padded(len(points))
+        points, pixels, weights = measured.points, measured.pixels, measured.weights
+        normals, depths = measured.normals, measured.depths
         own = own.copy()
         own[self._constant] = state.parameters[self._constant]
         model, free, left = self._model, self._free, np.zeros_like(pixels)
@@ -315,7 +311,7 @@ class StillProblem:
             if np.abs(change).max() < 1e-6:
                 break
         far = np.zeros(len(points)) if depths is None else depths.terms(points, replace(state, parameters=own))[3]
-        return own, np.nan_to_num(left), weights, far
+        return own, np.nan_to_num(left), far
 
     def fitted(self, unknowns: Array) -> StillFit:
         """The result at the minimum."""
