@@ -119,11 +119,7 @@ class PointDepths:
 
     def terms(self, points: BoundPoints, state: State) -> tuple[float, Array, Array, Array]:
         """Cost, Hessian (d + 6, d + 6), gradient and residuals (p,) in pixels at a state."""
-        pose = state.camera_from_object
-        return linearise_depths(
-            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, self.depths, self.weights, self.huber_px,
-        )  # fmt: skip
+        return linearise_depths(*points.in_state(state), self.depths, self.weights, self.huber_px)
 
 
 def _plane_depth(image: NDArray[np.float32], pixels: Array) -> Array:

@@ -60,11 +60,8 @@ class LinearCost:
         cls, measured: Observations, state: State, residuals: Array, camera: Camera, huber_px: float, scale: Array
     ) -> LinearCost:
         """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
-        points, pose = measured.points, state.camera_from_object
-        weighted_jacobian, hessian = weighted_derivatives(
-            points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-            points.field.modes, camera.intrinsics, residuals, measured.weights, measured.normals, huber_px,
-        )  # fmt: skip
+        points, seen = measured.points, (residuals, measured.weights, measured.normals, huber_px)
+        weighted_jacobian, hessian = weighted_derivatives(*points.in_state(state), camera.intrinsics, *seen)
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)
@@ -235,26 +232,6 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance)[len(self.state.parameters) :])
 
 
-def pixel_terms(
-    camera: Camera, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array, huber_px: float
-) -> tuple[float, Array, Array, Array]:
-    """Cost, Hessian (d + 6, d + 6), gradient (d + 6,) and residuals (p, 2) of pixels; see `reprojection.linearise`.
-
-    Parameters
-    ----------
-    camera : that saw the points.
-    points : p of them.
-    pixels, weights, normals : (p, 2), (p,) and (p, 2), as of `Estimator.evaluate`.
-    state : of the object.
-    huber_px : residual length where Huber's cost turns linear.
-    """
-    pose = state.camera_from_object
-    return linearise(
-        points.field.functions.rows(state.parameters), pose.rotation, pose.translation, points.rest,
-        points.field.modes, camera.intrinsics, pixels, weights, normals, huber_px,
-    )  # fmt: skip
-
-
 class Estimator:
     """Finds states from pixels of bound points, with one camera and one model."""
 
@@ -322,7 +299,8 @@ class Estimator:
         self, points: BoundPoints, pixels: Array, weights: Array, state: State, normals: Array
     ) -> tuple[float, Array, Array, Array]:
         """What `evaluate` gives of the pixels alone."""
-        return pixel_terms(self.camera, points, pixels, weights, state, normals, self.options.huber_px)
+        seen = pixels, weights, normals, self.options.huber_px
+        return linearise(*points.in_state(state), self.camera.intrinsics, *seen)
 
     def within(self, box: Box) -> Self:
         """The same, whose parameters stay in another box."""

@@ -18,20 +18,12 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.registration import PosePrior
-from morph_dslam.tracking.estimator import (
-    BoundPoints,
-    Estimate,
-    EstimationOptions,
-    Estimator,
-    LinearCost,
-    Prior,
-    State,
-    pixel_terms,
-)
+from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, Estimator, LinearCost, Prior, State
 from morph_dslam.tracking.known_values import KnownParameters
 from morph_dslam.tracking.levenberg_marquardt import minimise
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.reference import PosedImage
+from morph_dslam.tracking.reprojection import linearise
 
 Array = NDArray[np.float64]
 
@@ -202,9 +194,8 @@ class PointsEstimator(Estimator):
         size, huber_px = len(state.parameters) + 6, self.options.huber_px
         cost, hessian, gradient, residuals = 0.0, np.zeros((size, size)), np.zeros(size), np.empty_like(pixels)
         for part, chain, rows in self._seen:
-            found = pixel_terms(
-                part.camera, points.take(rows), pixels[rows], weights[rows], part.seen(state), normals[rows], huber_px
-            )
+            of_part, seen = points.take(rows).in_state(part.seen(state)), (pixels[rows], weights[rows], normals[rows])
+            found = linearise(*of_part, part.camera.intrinsics, *seen, huber_px)
             cost += found[0]
             hessian += chain.T @ found[1] @ chain
             gradient += chain.T @ found[2]

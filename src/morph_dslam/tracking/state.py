@@ -65,6 +65,12 @@ class BoundPoints:
         field = self.field.with_modes(self.field.modes[:, rows])
         return BoundPoints(self.surface.take(rows), self.rest[rows], field)
 
+    def in_state(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
+        """What compiled functions take of the points in a state; see `reprojection.linearise`."""
+        pose = state.camera_from_object
+        rows = self.field.functions.rows(state.parameters)
+        return rows, pose.rotation, pose.translation, self.rest, self.field.modes
+
     def in_camera(self, state: State) -> Array:
         """Positions (p, 3) in the camera frame, metres."""
         pose = state.camera_from_object
