@@ -18,11 +18,11 @@ from morph_dslam.evaluation.run_folder import load_run
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.registration.registration import PosePrior
 from morph_dslam.sources import open_source
+from morph_dslam.tracking.anchoring import CameraLocalization
 from morph_dslam.tracking.outcomes import CameraLost, ObjectMoved
 from morph_dslam.tracking.placement import new_anchor
 from morph_dslam.tracking.sinks import VideoSink
 from morph_dslam.tracking.track import new_session, prepare
-from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_anchored import SCAN
 
 #: What the map made from the scan is off by, and the registration with it, metres.

@@ -14,12 +14,12 @@ from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import load_model
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import Frame, open_source
+from morph_dslam.tracking.anchoring import CameraLocalization
 from morph_dslam.tracking.drawing import AugmentedPicture, AugmentedView, DrawOptions
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.outcomes import ObjectMoved, Status
 from morph_dslam.tracking.placement import new_anchor
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_anchored_rig import FRAMES, RIG, SCAN
 from tests.support.tracked_rig import column, errors, exact_nodes, placed_objects
 

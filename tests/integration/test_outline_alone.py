@@ -15,12 +15,12 @@ from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_e
 from morph_dslam.model.parameter_errors import parameter_errors
 from morph_dslam.registration.registration import MapRegistration, PosePrior, Registration
 from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.tracking.anchoring import CameraLocalization
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.run_notices import RunWarning, notices_of
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.tracker import CameraLocalization
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, colours, mean_error
 from tests.support.turning_block import turning_block
 

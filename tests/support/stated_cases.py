@@ -16,10 +16,11 @@ from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import Ambiguous, AtBound, OutlineElsewhere, PoorFit, Underdetermined, WrongUnit
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.render.rasteriser import rasterise, visible_points
+from morph_dslam.tracking.anchoring import CameraLocalization
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.run_notices import notices_of
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+from morph_dslam.tracking.tracker import Tracker
 from tests.support.rendered_sequence import mean_error
 from tests.support.staged_scenes import Scene, aside, is_beyond, is_doubted
 

@@ -8,7 +8,7 @@ deformation does not draw the camera along; what cannot stays with the scene.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -26,11 +26,13 @@ from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import RigidMap
 from morph_dslam.slam.rolling_shutter import MiddleRowPoses
 from morph_dslam.slam.slam import Slam
+from morph_dslam.sources import Frame
 from morph_dslam.tracking.covariance import EIGENVALUE_FLOOR
 from morph_dslam.tracking.estimator import Estimator, Prior, State, moved
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.tracker_inputs import Picture
 
 Array = NDArray[np.float64]
 #: A map point this near to the surface, over the object's size, lies on it: that is what maps are good for.
@@ -59,6 +61,24 @@ def points_on_object(
     distances, nearest = KDTree(model.rest_positions(samples)).query(in_object)
     on_object = distances < ON_SURFACE * size
     return on_object, on_object & (reach[nearest] > MOVES * size)
+
+
+@dataclass(frozen=True)
+class CameraLocalization:
+    """Where the map has the object in a frame.
+
+    Attributes
+    ----------
+    pose_prior : of the object; None for a free one, or where the camera is lost.
+    why_lost : why the camera is; empty if it is not.
+    milliseconds : that it took.
+    image : the frame made ready, where it was needed for that by the same camera.
+    """
+
+    pose_prior: PosePrior | None = None
+    why_lost: str = ""
+    milliseconds: float = 0.0
+    image: Image | None = None
 
 
 class Anchor:
@@ -111,11 +131,6 @@ class Anchor:
             raise RegistrationError("the registration has no scene to find the camera in: register in a mapped scene")
         return cls(first.scene.map, camera, placed)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the objects."""
-        return tuple(self._places)
-
     def locate(self, image: NDArray[np.uint8], index: int, timestamp: float) -> tuple[dict[str, PosePrior], SlamFrame]:
         """The objects by name in a frame (h, w, 3), none where the camera is lost in the map; the camera."""
         frame = self.slam.process_frame(image, index, timestamp)
@@ -126,12 +141,12 @@ class Anchor:
             pose = replace(pose, camera_from_world=self._rows.add(timestamp, pose.camera_from_world, frame.points))
         return {name: place.pose_prior(pose) for name, place in self._places.items()}, frame
 
-    def image_for(self, camera: Camera) -> Image | None:
-        """The frame that was located last as a tracker with this camera takes it; None if it is of another one."""
-        view = self.slam.newest_view
-        if view is None or self.slam.frame_images.camera != camera:
-            return None
-        return Image(view.grey, view.normalized)
+    def localized(self, frame: Frame, camera: Camera) -> dict[str, CameraLocalization]:
+        """Each object by name in a frame of a tracker's camera."""
+        poses, found = self.locate(Picture.of(frame, camera).image, frame.index, frame.timestamp)
+        view = self.slam.newest_view if self.slam.frame_images.camera == camera else None
+        image, why = None if view is None else Image(view.grey, view.normalized), str(found.reason or "")
+        return {name: CameraLocalization(poses.get(name), why, found.total_ms, image) for name in self._places}
 
 
 def _check_places(movable: Mapping[str, NDArray[np.bool_]]) -> None:

@@ -16,7 +16,7 @@ from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import MissingFrame
 from morph_dslam.timing import frame_clock, stage
-from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor
+from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor, CameraLocalization
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_results import with_flat_sides, with_model_errors
@@ -47,7 +47,7 @@ from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
 from morph_dslam.tracking.rig_errors import RigErrors
 from morph_dslam.tracking.systematic_errors import error_factors_of
-from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.tracker_inputs import check_pose, check_tracker
 from morph_dslam.tracking.views import KeyframeViews
 

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.model import ReducedModel
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.anchoring import CameraLocalization
 from morph_dslam.tracking.binding import draw_view, view_of
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.outcomes import PoseSource, SamePlace
 from morph_dslam.tracking.overlap import Body
 from morph_dslam.tracking.result import FrameResult
-from morph_dslam.tracking.tracker import CameraLocalization, Tracker
+from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.tracker_inputs import widened
 
 

@@ -13,15 +13,14 @@ from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import check_frame
 from morph_dslam.sources.live import LiveStream
 from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
-from morph_dslam.tracking.anchoring import Anchor
+from morph_dslam.tracking.anchoring import Anchor, CameraLocalization
 from morph_dslam.tracking.drawing import AugmentedPicture
 from morph_dslam.tracking.live import LivePipeline
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import MultiObjectTracker
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.sinks import Sink, TrackedFrame
-from morph_dslam.tracking.tracker import CameraLocalization, Tracker
-from morph_dslam.tracking.tracker_inputs import Picture
+from morph_dslam.tracking.tracker import Tracker
 
 Localizations = dict[str, CameraLocalization]
 
@@ -86,10 +85,7 @@ class Session:
         """Find the first camera of the next frames in the map, and with it each anchored object."""
         if self._anchor is None:
             return {name: tracker.locate(frames[0]) for name, tracker in self.trackers.items()}
-        frame, first = frames[0], next(iter(self.trackers.values()))
-        poses, camera = self._anchor.locate(Picture.of(frame, first.camera).image, frame.index, frame.timestamp)
-        why, image = str(camera.reason or ""), self._anchor.image_for(first.camera)
-        return {name: CameraLocalization(poses.get(name), why, camera.total_ms, image) for name in self._anchor.names}
+        return self._anchor.localized(frames[0], next(iter(self.trackers.values())).camera)
 
     def track(self, frames: tuple[Frame, ...], localizations: Localizations) -> TrackedFrame:
         """Find the objects in frames that `locate` has seen."""

@@ -8,7 +8,7 @@ changes: the previous frames only say where to start.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.slam.self_calibration import OffByFactors
 from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
-from morph_dslam.tracking.anchoring import Anchor, Anchoring
+from morph_dslam.tracking.anchoring import Anchor, Anchoring, CameraLocalization
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
@@ -74,24 +74,6 @@ from morph_dslam.tracking.views import (
 )
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class CameraLocalization:
-    """Where the map has the object in a frame.
-
-    Attributes
-    ----------
-    pose_prior : of the object; None for a free one, or where the camera is lost.
-    why_lost : why the camera is; empty if it is not.
-    milliseconds : that it took.
-    image : the frame made ready, where it was needed for that by the same camera.
-    """
-
-    pose_prior: PosePrior | None = None
-    why_lost: str = ""
-    milliseconds: float = 0.0
-    image: Image | None = None
 
 
 class Tracker:
@@ -263,10 +245,7 @@ class Tracker:
         """
         if not isinstance(frame, Frame) or self.anchor is None:
             return CameraLocalization()
-        image = Picture.of(frame, self.camera).image
-        poses, camera = self.anchor.locate(image, frame.index, frame.timestamp)
-        image = self.anchor.image_for(self.camera)
-        return CameraLocalization(next(iter(poses.values()), None), str(camera.reason or ""), camera.total_ms, image)
+        return next(iter(self.anchor.localized(frame, self.camera).values()))
 
     def _from_scene(self) -> Image:
         """Take what the scene shows of the object, and its map, and return the reference image."""
