@@ -19,7 +19,7 @@ from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor, CameraLocalization
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
-from morph_dslam.tracking.frame_results import with_flat_sides, with_model_errors
+from morph_dslam.tracking.frame_results import warnings_of_place, with_flat_sides, with_model_errors
 from morph_dslam.tracking.frame_starts import new_filter
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.noise import RigObservations
@@ -27,7 +27,6 @@ from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, TrackerOption
 from morph_dslam.tracking.outcomes import (
     BlurredByMotion,
     CameraIgnored,
-    CameraLost,
     CamerasDisagree,
     DepthNotUsed,
     FewPointsAgree,
@@ -207,17 +206,13 @@ class RigTracker:
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
-        warnings: list[TrackingWarning] = [*self.estimator.known.warnings, *_ignored(results, measured)]
-        if has_moved:
-            warnings.append(ObjectMoved())
-        if where.why_lost:
-            warnings.append(CameraLost(where.why_lost))
+        told = (*self.estimator.known.warnings, *_ignored(results, measured))
         is_hidden = estimate is None and known is not None and not has_moved
         result = FrameResult(
             self.model,
             Status.HIDDEN if is_hidden else Status.LOST,
             rejection=rejection,
-            warnings=tuple(warnings),
+            warnings=(*told, *warnings_of_place(has_moved, (), 0, where.why_lost)),
             pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
             pose_prior=known if is_hidden else None,
             n_points=sum(result.n_points for result in results),
