@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from morph_dslam.errors import StudyError
-from morph_dslam.meshing.meshes import Mesh, jacobian_determinants
+from morph_dslam.meshing.meshes import Mesh, jacobian_determinants, parts_of_cells
 
 Indices = NDArray[np.int64]
 #: Diagonals of the bounding box (metres) beyond which a length unit was probably mistaken.
@@ -191,17 +189,12 @@ def _check_faces(mesh: Mesh) -> None:
 
 
 def _check_connection(mesh: Mesh) -> None:
-    rows = [block.connectivity[:, :1].repeat(block.connectivity.shape[1], axis=1) for block in mesh.blocks]
-    row = np.concatenate([part.ravel() for part in rows])
-    column = np.concatenate([block.connectivity.ravel() for block in mesh.blocks])
-    links = coo_array((np.ones(len(row)), (row, column)), shape=(mesh.n_nodes, mesh.n_nodes))
-    _, part = connected_components(links, directed=False)
-    used = np.unique(column)
-    if len(used) < mesh.n_nodes:
-        loose = np.setdiff1d(np.arange(mesh.n_nodes), used)
+    loose = np.flatnonzero(~mesh.used)
+    if len(loose):
         raise StudyError(
             f"{len(loose)} nodes belong to no cell, the first at {_millimetres(mesh.nodes[loose[0]])}; remove them"
         )
+    _, part = parts_of_cells(mesh)
     sizes = np.bincount(part)
     if len(sizes) > 1:
         second = np.flatnonzero(part == np.argsort(-sizes)[1])

@@ -206,11 +206,17 @@ class Mesh:
         sets = {name: moved(old) for name, old in self.node_sets.items()}
         return replace(self, nodes=nodes, blocks=blocks, node_sets=sets)
 
-    def without_unused_nodes(self) -> Mesh:
-        """The mesh without the nodes that belong to no cell."""
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which nodes (n,) belong to cells."""
         used = np.zeros(self.n_nodes, dtype=bool)
         for block in self.blocks:
             used[block.connectivity] = True
+        return used
+
+    def without_unused_nodes(self) -> Mesh:
+        """The mesh without the nodes that belong to no cell."""
+        used = self.used
         return self.renumbered(np.where(used, np.cumsum(used) - 1, -1), self.nodes[used])
 
 
@@ -319,6 +325,17 @@ def with_found_surfaces(mesh: Mesh) -> Mesh:
     named = {*mesh.surfaces, *mesh.node_sets, *mesh.cell_sets}
     new = {name: faces for name, faces in (end_surfaces(mesh) | _cavities(mesh)).items() if name not in named}
     return replace(mesh, surfaces={**mesh.surfaces, **new}, found=mesh.found | new.keys())
+
+
+def parts_of_cells(mesh: Mesh) -> tuple[int, Indices]:
+    """How many parts that share no node a mesh falls into, and the number of its part (n,) of each node.
+
+    A node of no cell is a part of its own.
+    """
+    ends = [np.broadcast_arrays(block.connectivity[:, :1], block.connectivity) for block in mesh.blocks]
+    row, column = np.concatenate([np.reshape(pair, (2, -1)) for pair in ends], axis=1)
+    links = sparse.coo_array((np.ones(len(row)), (row, column)), shape=(mesh.n_nodes, mesh.n_nodes))
+    return csgraph.connected_components(links, directed=False)
 
 
 def parts_of(mesh: Mesh, faces: Indices) -> Indices:

@@ -21,7 +21,7 @@ from morph_dslam.meshing.meshes import Mesh, model_mesh_of
 from morph_dslam.model import Parameter
 from morph_dslam.studies.external_checks import check_strain, check_stress
 from morph_dslam.studies.external_doubts import doubts
-from morph_dslam.studies.external_mesh import announced_mesh, check_same, mesh_of, used_nodes
+from morph_dslam.studies.external_mesh import announced_mesh, check_same, mesh_of
 from morph_dslam.studies.external_reactions import PointForces, as_fields, columns_of
 from morph_dslam.studies.external_table import SolutionTable
 from morph_dslam.studies.problem import ModelMesh, Snapshot
@@ -106,7 +106,7 @@ class ExternalStudy(Section):
             content = read_solution(path, row.get("step") or None)
             here = mesh_of(content, section.length_unit, path)
             if first is None:
-                first, used = here, used_nodes(here)
+                first, used = here, here.used
                 made = model_mesh_of(announced_mesh(here, section.length_unit, path))
             check_same(first, here, path)
             exerted = {name: values[number] for name, values in outputs.items()}

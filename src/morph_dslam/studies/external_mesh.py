@@ -7,18 +7,15 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_checks import check_corners, check_mesh, wrong_cells
 from morph_dslam.meshing.mesh_repair import reoriented
 from morph_dslam.meshing.mesh_summary import described_mesh
-from morph_dslam.meshing.meshes import CellBlock, Mesh
+from morph_dslam.meshing.meshes import CellBlock, Mesh, parts_of_cells
 from morph_dslam.studies.problem import announce
 from morph_dslam.studies.solid_sections import check_unit
-from morph_dslam.studies.solution_files import SAME
+from morph_dslam.studies.solution_files import SAME, points_in_space
 from morph_dslam.units import to_si
 
 #: Cell types by the names that meshio gives them; the order of their nodes is VTK's, or that of linear prisms ours.
@@ -49,21 +46,12 @@ def mesh_of(content: meshio.Mesh, unit: str, path: Path) -> Mesh:
             f"known are {', '.join(_CELL_TYPES)}"
         )
     made = tuple(CellBlock(_CELL_TYPES[block.type], np.asarray(block.data, dtype=np.int64)) for block in blocks)
-    nodes = np.zeros((len(content.points), 3))
-    nodes[:, : content.points.shape[1]] = content.points
+    nodes = points_in_space(content)
     for block in made:
         check_corners(block.connectivity, len(nodes), path, points="points")
     mesh = Mesh(to_si(1.0, unit, "length") * nodes, made)
     turned = zip(made, reoriented(mesh).blocks, strict=True)
     return replace(mesh, blocks=tuple(new if new.cell_type == "prism6" else old for old, new in turned))
-
-
-def used_nodes(mesh: Mesh) -> NDArray[np.bool_]:
-    """Which nodes (n,) belong to cells."""
-    used = np.zeros(mesh.n_nodes, dtype=bool)
-    for block in mesh.blocks:
-        used[block.connectivity] = True
-    return used
 
 
 def announced_mesh(mesh: Mesh, unit: str, path: Path) -> Mesh:
@@ -95,11 +83,7 @@ def _check_order(mesh: Mesh) -> None:
 
 def _parts(mesh: Mesh) -> list[Mesh]:
     """The parts of a mesh that share no node, each by itself: other programs tie them, or let them touch."""
-    joined = [block.connectivity for block in mesh.blocks]
-    ends = [np.stack(np.broadcast_arrays(cells[:, :1], cells)).reshape(2, -1) for cells in joined]
-    row, column = np.concatenate(ends, axis=1)
-    links = coo_array((np.ones(len(row)), (row, column)), shape=(mesh.n_nodes, mesh.n_nodes))
-    count, part = connected_components(links, directed=False)
+    count, part = parts_of_cells(mesh)
     if count == 1:
         return [mesh]
     return [

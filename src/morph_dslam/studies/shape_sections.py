@@ -24,7 +24,7 @@ from morph_dslam.model.reduced_model import state_text
 from morph_dslam.studies.affine import Affine, read_affine
 from morph_dslam.studies.sections import Length, LengthUnit, Number, Section, SetName, StudyPath
 from morph_dslam.studies.solid_sections import Reader, Value
-from morph_dslam.studies.solution_files import SAME, point_data, read_solution
+from morph_dslam.studies.solution_files import SAME, point_data, points_in_space, read_solution
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
@@ -93,8 +93,7 @@ class _FieldShape(_ShapeSection):
 
     def moves(self, mesh: Mesh) -> Array:
         unit, content = to_si(1.0, self.unit, "length"), read_solution(self.file, whole=False)
-        points = np.zeros((len(content.points), 3))
-        points[:, : content.points.shape[1]] = unit * content.points
+        points = unit * points_in_space(content)
         if not np.isfinite(points).all():
             raise StudyError(f"{self.file} has points whose coordinates are not finite")
         values = unit * point_data(content, self.field, (3,), self.file)

@@ -56,6 +56,13 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
         raise StudyError(f"cannot read the solution {path}: {error}") from error
 
 
+def points_in_space(content: meshio.Mesh) -> Array:
+    """Coordinates (n, 3) of a file's points; those of a plane file lie at z = 0."""
+    points = np.zeros((len(content.points), 3))
+    points[:, : content.points.shape[1]] = content.points
+    return points
+
+
 def point_data(
     content: meshio.Mesh, name: str, widths: tuple[int, ...], path: Path, used: NDArray[np.bool_] | None = None
 ) -> Array:
