@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.kinematics import Kinematics, Shape
 from morph_dslam.mechanics.load_modes import LoadedSurface
-from morph_dslam.mechanics.loads import BodyForce, EdgeLoad, Gravity, Load, NodalForces, PointLoad
+from morph_dslam.mechanics.loads import BodyForce, EdgeLoad, Gravity, Load
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.mechanics.parameters import ParameterSymbols, Scalar
 from morph_dslam.mechanics.shell_energy import AveragedNormals, ShellKinematics, ShellUnknowns, rim_angle, unit
@@ -31,7 +31,7 @@ from morph_dslam.mechanics.solid_assembly import Assembly, Term
 from morph_dslam.mechanics.solvers.linear_solver import TangentSolver
 from morph_dslam.mechanics.solvers.newton import Linearisation
 from morph_dslam.mechanics.spaces import DisplacementSpace
-from morph_dslam.mechanics.supports import Constraints, ElasticFoundation
+from morph_dslam.mechanics.supports import Constraints
 from morph_dslam.mechanics.surface_mesh import SurfaceMesh
 from morph_dslam.meshing.meshes import Mesh
 
@@ -122,13 +122,7 @@ class ShellProblem(SolidProblem):
         )
         self.assembly = _ShellAssembly(self.space, self._terms(), self.symbols, self.refresh_normals)
         self._held_rotations = self._rotation_dofs([edge for _, edges in held for edge in edges])
-        self.free: NDArray[np.bool_] = self._free_dofs()
-        scale = np.full(self.n_dofs, np.inf)
-        scale[: 3 * self.displacements.n_scalar] = self.length
-        self.scale: Array | float = scale
-        self._latest = None
-        points = [load for load in loads if isinstance(load, PointLoad)]
-        self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
+        self._set_up_dofs()
 
     def _edge_directions(self, sets: list[str]) -> Array:
         """Unit vectors (e, 3) along the edges of node sets."""
@@ -201,12 +195,7 @@ class ShellProblem(SolidProblem):
         moved = unknowns.displacement - self._anchor
         terms.append(Term(0.5 * self._drag * (moved * moved), everywhere, bonus))
         at_points, test = Kinematics(unknowns.displacement, self.shape), self.space.TestFunction()[0]
-        for support in self.supports:
-            if isinstance(support, ElasticFoundation):
-                terms.append(Term(support.energy(at_points), self.geometry.boundary(support.on)))
-        for load in self.loads:
-            terms += self._load_terms(load, at_points, test)
-        return terms
+        return terms + self._outer_terms(at_points, test)
 
     def _load_terms(self, load: Load, kinematics: Kinematics, test: Any) -> list[Term]:
         if isinstance(load, EdgeLoad):

@@ -142,16 +142,19 @@ class SolidProblem:
         self.n_dofs: int = self.n_unknowns
         self.constraints = Constraints(self.displacements, self.shape, self.supports, self.symbols)
         self.constraints.check_rigid_motions(self._held_motions())
-        n_displacements = 3 * self.displacements.n_scalar
         self.assembly = self._make_assembly()
         self.contact = self._make_contact(contacts)
         self.applied_first: Callable[[], SolidProblem] | None = None
+        self._set_up_dofs()
+
+    def _set_up_dofs(self) -> None:
+        """Which dofs are free, how they are measured, and the forces of points on them."""
         self.free: NDArray[np.bool_] = self._free_dofs()
         scale = np.full(self.n_dofs, np.inf)
-        scale[:n_displacements] = self.length
+        scale[: 3 * self.displacements.n_scalar] = self.length
         self.scale: Array | float = scale
         self._latest: tuple[Array, Array, Array] | None = None
-        points = [load for load in loads if isinstance(load, PointLoad)]
+        points = [load for load in self.loads if isinstance(load, PointLoad)]
         self._nodal_forces = NodalForces(self.displacements, points, self.symbols)
 
     def _held_motions(self) -> Array:
@@ -226,12 +229,13 @@ class SolidProblem:
             )
             for region, unknowns in zip(self.regions, pressures, strict=True)
         ]
-        for support in self.supports:
-            if isinstance(support, ElasticFoundation):
-                terms.append(Term(support.energy(kinematics), self.geometry.boundary(support.on)))
-        for load in self.loads:
-            terms += self._load_terms(load, kinematics, test)
-        return terms
+        return terms + self._outer_terms(kinematics, test)
+
+    def _outer_terms(self, kinematics: Kinematics, test: Any) -> list[Term]:
+        """Those of foundations and loads."""
+        springs = [support for support in self.supports if isinstance(support, ElasticFoundation)]
+        terms = [Term(support.energy(kinematics), self.geometry.boundary(support.on)) for support in springs]
+        return terms + [term for load in self.loads for term in self._load_terms(load, kinematics, test)]
 
     def _make_assembly(self) -> Assembly | EnhancedAssembly:
         terms, n_displacements = self._terms(), 3 * self.displacements.n_scalar

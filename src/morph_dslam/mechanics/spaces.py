@@ -75,6 +75,7 @@ class DisplacementSpace:
     node_values : sparse (n_nodes, n_scalar): values at nodes from coefficients.
     coefficients : sparse (n_scalar, n_nodes): coefficients of the interpolation of nodal values.
     coordinates : (n_scalar, 3) coefficients of the position X, m.
+    constant : (n_scalar,) coefficients of the constant 1.
     bonus_order : what integrals over cells need beyond NGSolve's own order of quadrature.
     """
 
@@ -104,6 +105,8 @@ class DisplacementSpace:
         self._relate_nodes()
         self.bonus_order = 0
         self.coordinates: Array = self.coefficients @ mesh.nodes
+        # One at vertices, zero for bubbles.
+        self.constant: Array = (np.arange(self.n_scalar) < geometry.ngs.nv).astype(np.float64)
         self._curve()
 
     def _make_blocks(self) -> list[_BlockBasis]:

@@ -48,9 +48,6 @@ class SupportForces:
         self._foundations = [s for s in supports if isinstance(s, ElasticFoundation)]
         self._named = {support.on for support in supports}
         self._shares = constraints.shares()
-        # Coefficients of the constant 1: one at vertices, zero for bubbles.
-        self._constant = np.zeros(space.n_scalar)
-        self._constant[: space.geometry.ngs.nv] = 1.0
 
     def resultant(self, name: str, forces: Array, displacement: Array, about: Array | None) -> tuple[Array, Array]:
         """Force (3,), N, and moment (3,), N m, of the supports of a set.
@@ -66,7 +63,7 @@ class SupportForces:
         f = self._share(name) * forces
         if name in self._springs:
             f = f - self._springs[name].residual(displacement.ravel()).reshape(f.shape)
-        return f @ self._constant, np.cross(self._arms(displacement, about), f.T).sum(axis=0)
+        return f @ self._space.constant, np.cross(self._arms(displacement, about), f.T).sum(axis=0)
 
     def resultant_slopes(
         self,
@@ -100,11 +97,11 @@ class SupportForces:
         if by_parameters:
             arm_slopes = arm_slopes + np.array(self._shape.coordinate_slopes(self._symbols))
         moments = np.cross(arm_slopes, f.T) + np.cross(self._arms(u, about), f_slopes.transpose(0, 2, 1))
-        return f_slopes @ self._constant, moments.sum(axis=1)
+        return f_slopes @ self._space.constant, moments.sum(axis=1)
 
     def _arms(self, displacement: Array, about: Array) -> Array:
         """(n_scalar, 3) coefficients of the deformed position from a point."""
-        return self._shape.coordinates(self._symbols) + displacement.T - np.outer(self._constant, about)
+        return self._shape.coordinates(self._symbols) + displacement.T - np.outer(self._space.constant, about)
 
     def _share(self, name: str) -> Array:
         """(3, n_scalar) part of the held forces that the supports of a set have."""

@@ -42,9 +42,6 @@ class Constraints:
         self._space, self._shape, self._symbols, self._mesh = space, shape, symbols, space.geometry.mesh
         self._foundations = [s for s in supports if isinstance(s, ElasticFoundation)]
         self._motions: list[PrescribedMotion] = [s for s in supports if not isinstance(s, ElasticFoundation)]
-        # Coefficients of the constant 1: one at vertices, zero for bubbles.
-        self._constant = np.zeros(space.n_scalar)
-        self._constant[: space.geometry.ngs.nv] = 1.0
         held = np.zeros((3, space.n_scalar), dtype=bool)
         self._parts: list[tuple[PrescribedMotion, int, Indices]] = []
         self._hidden: list[tuple[PrescribedMotion, int, Indices]] = []
@@ -69,7 +66,7 @@ class Constraints:
         """(k,) what a support prescribes for a component at k dofs, whichever support decides."""
         affine = motion.motion(self._symbols, *self._centroid(motion))
         rigid = self._shape.coordinates(self._symbols)[dofs] @ affine.matrix[component]
-        return np.asarray(rigid + self._constant[dofs] * affine.shift[component])
+        return np.asarray(rigid + self._space.constant[dofs] * affine.shift[component])
 
     def without_effect(self) -> tuple[PrescribedMotion, list[int], list[PrescribedMotion]] | None:
         """The first support that moves its set, by the study, where others that come before it have decided all.
@@ -116,7 +113,7 @@ class Constraints:
         for motion, component, dofs in self._resting_rotations(begin):
             affine = motion.part(self._symbols, share).motion(self._symbols, *self._centroid(motion))
             rigid = coordinates[dofs] @ affine.matrix[component]
-            way[component, dofs] = rigid + self._constant[dofs] * affine.shift[component]
+            way[component, dofs] = rigid + self._space.constant[dofs] * affine.shift[component]
         return way.ravel()
 
     def _resting_rotations(self, x: Array) -> list[tuple[RigidRotation, int, Indices]]:
@@ -146,7 +143,7 @@ class Constraints:
             result[:, component, dofs] = (
                 affine.matrix_slopes[:, component] @ coordinates[dofs].T
                 + coordinate_slopes[:, dofs] @ affine.matrix[component]
-                + affine.shift_slopes[:, component, None] * self._constant[dofs]
+                + affine.shift_slopes[:, component, None] * self._space.constant[dofs]
             )
         return result.reshape(len(self._symbols), 3 * self._space.n_scalar)
 
@@ -207,11 +204,11 @@ class Constraints:
 
     def rigid_modes(self) -> Array:
         """(3, n_scalar, 6) coefficients of unit translations and of rotations scaled to unit size."""
-        centred = self._space.coordinates - np.outer(self._constant, self._mesh.nodes.mean(axis=0))
+        centred = self._space.coordinates - np.outer(self._space.constant, self._mesh.nodes.mean(axis=0))
         centred /= np.abs(centred).max()
         modes = np.zeros((3, self._space.n_scalar, 6))
         for axis in range(3):
-            modes[axis, :, axis] = self._constant
+            modes[axis, :, axis] = self._space.constant
             i, j = (axis + 1) % 3, (axis + 2) % 3
             modes[j, :, 3 + axis] = centred[:, i]
             modes[i, :, 3 + axis] = -centred[:, j]
