@@ -16,8 +16,8 @@ from morph_dslam.cli.tracking_arguments import add_tracking_arguments
 from morph_dslam.errors import TrackingError
 
 if TYPE_CHECKING:
-    from morph_dslam import TrackOptions
-    from morph_dslam.extend.tracking import FoundInputs
+    from morph_dslam import TrackerOptions, TrackOptions
+    from morph_dslam.extend.tracking import FoundInputs, ObjectOptions
 
 HELP = "find an object's pose and parameters in every frame, and draw the stress over the video"
 #: Options that say where the object is.
@@ -244,7 +244,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
     """
     from morph_dslam import TrackerOptions, TrackOptions
     from morph_dslam.extend.registration import InitializerFiles
-    from morph_dslam.extend.tracking import DrawOptions, EstimationOptions, LoadOptions, ObjectOptions, SectionPlane
+    from morph_dslam.extend.tracking import DrawOptions, EstimationOptions, LoadOptions, SectionPlane
 
     tracker = TrackerOptions(
         pose=arguments.pose,
@@ -257,27 +257,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         new_views=not arguments.one_view,
         further_views=not arguments.one_view,
     )
-
-    def frames_of(name: str) -> tuple[tuple[int, Path | None], ...]:
-        return tuple((frame, path) for of, frame, path in arguments.reregister_at if of == name)
-
-    others = []
-    for name, model, start in arguments.also:
-        is_registered = start.endswith(".json")
-        is_free = not is_registered and tracker.pose != "still"
-        part = ObjectOptions(
-            model=Path(model),
-            landmarks=None if is_registered else Path(start),
-            registration=Path(start) if is_registered else None,
-            at_rest=arguments.at_rest and not is_registered,
-            snap=arguments.snap and not is_registered,
-            reregister_at=frames_of(name),
-            tracker=replace(tracker, pose="map") if is_free else tracker,
-        )
-        others.append((name, part))
-    unknown = {of for of, _, _ in arguments.reregister_at} - {"", *(name for name, _ in others)}
-    if unknown:
-        raise TrackingError(f"--reregister-at {min(unknown)}: there is no --also of that name")
+    others = _other_objects(arguments, tracker)
     first, last = arguments.range
     section = None if arguments.section is None else SectionPlane.parse(arguments.section)
     return TrackOptions(
@@ -293,7 +273,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         points=tuple(arguments.point),
         known=getattr(arguments, "known", None),
         time_zero=arguments.time_zero,
-        reregister_at=frames_of(""),
+        reregister_at=_reregistered_at(arguments, ""),
         tracker=replace(
             tracker,
             use_texture=not arguments.no_texture,
@@ -301,7 +281,7 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
             random_walk=_random_walk(arguments),
             modulus_std=0.01 * arguments.modulus_std,
         ),
-        others=tuple(others),
+        others=others,
         first=first,
         last=last,
         fps=arguments.fps,
@@ -314,6 +294,41 @@ def run_options(arguments: argparse.Namespace, **more: Any) -> TrackOptions:
         drawing=DrawOptions(arguments.show, section, arguments.forces),
         **more,
     )
+
+
+def _other_objects(arguments: argparse.Namespace, tracker: TrackerOptions) -> tuple[tuple[str, ObjectOptions], ...]:
+    """Names and options of the objects of ``--also``, tracked as the first one is.
+
+    Raises
+    ------
+    TrackingError
+        If one that is not among them is to be registered anew.
+    """
+    from morph_dslam.extend.tracking import ObjectOptions
+
+    others = []
+    for name, model, start in arguments.also:
+        is_registered = start.endswith(".json")
+        is_free = not is_registered and tracker.pose != "still"
+        part = ObjectOptions(
+            model=Path(model),
+            landmarks=None if is_registered else Path(start),
+            registration=Path(start) if is_registered else None,
+            at_rest=arguments.at_rest and not is_registered,
+            snap=arguments.snap and not is_registered,
+            reregister_at=_reregistered_at(arguments, name),
+            tracker=replace(tracker, pose="map") if is_free else tracker,
+        )
+        others.append((name, part))
+    unknown = {of for of, _, _ in arguments.reregister_at} - {"", *(name for name, _ in others)}
+    if unknown:
+        raise TrackingError(f"--reregister-at {min(unknown)}: there is no --also of that name")
+    return tuple(others)
+
+
+def _reregistered_at(arguments: argparse.Namespace, name: str) -> tuple[tuple[int, Path | None], ...]:
+    """Frames in which an object is registered anew, and by which landmarks; "" is the first object."""
+    return tuple((frame, path) for of, frame, path in arguments.reregister_at if of == name)
 
 
 def _random_walk(arguments: argparse.Namespace) -> tuple[tuple[str, float], ...]:
