@@ -226,6 +226,45 @@ def test_what_is_built_is_not_what_it_is_built_from(words, with_inputs: Path, mo
     assert contents(with_inputs) == before
 
 
+LAW = """
+from ngsolve import Det, InnerProduct, log
+def rubber(F, mu):
+    return mu * (InnerProduct(F, F) - 2.0 * log(Det(F)))
+"""
+#: By kind of study, text that names files of its own.
+NAMING = {
+    "solid": """name = "block"
+shape = [{ kind = "field", file = "growth.vtu", unit = "mm", amplitude = "growth" }]
+supports = [{ kind = "fixed", on = "z_min" }]
+contacts = [{ kind = "mesh", on = "z_max", file = "ball.stl", unit = "m" }]
+mesh = { file = "block.inp", unit = "mm" }
+materials.rubber = { law = "user_material", function = "law.py:rubber", mu = 1.0 }
+parameters.growth = { range = [0.0, 0.1] }
+""",
+    "external": 'name = "block"\nexternal = { table = "table.csv", length_unit = "mm" }\n',
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        *(("solid", name) for name in ("growth.vtu", "ball.stl", "block.inp", "law.py")),
+        *(("external", name) for name in ("table.csv", "solutions/1.vtu", "solutions/2.h5")),
+    ],
+)
+def test_a_build_replaces_no_file_that_its_study_names(kind, name, with_inputs: Path, monkeypatch, refused) -> None:
+    monkeypatch.chdir(with_inputs)
+    Path("study.toml").write_text(NAMING[kind])
+    Path("law.py").write_text(LAW)
+    Path("solutions").mkdir()
+    for own in ("growth.vtu", "block.inp", "solutions/1.vtu", "solutions/2.h5"):
+        Path(own).write_text("mine")
+    Path("table.csv").write_text("file,step,force [N]\nsolutions/1.vtu,,1\nsolutions/2.xdmf,0,2\n")
+    before = contents(with_inputs)
+    assert f"{name} is an input of this command" in refused("build", "study.toml", "-o", name)
+    assert contents(with_inputs) == before
+
+
 POSE = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 620]\n"
 
 

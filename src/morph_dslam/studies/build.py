@@ -39,7 +39,7 @@ from morph_dslam.studies.shell_study import ShellStudy
 from morph_dslam.studies.solid_sections import make_mesh
 from morph_dslam.studies.solid_study import SolidStudy
 from morph_dslam.studies.solutions import Snapshots, take_snapshots
-from morph_dslam.studies.study import Study, load_study, study_file, study_mesh_deviation, study_mesh_notes
+from morph_dslam.studies.study import Study, input_files, load_study, study_file, study_mesh_deviation, study_mesh_notes
 from morph_dslam.studies.time_sampling import time_instants
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 from morph_dslam.studies.weights import announced_mass
@@ -118,9 +118,9 @@ def build(
     if not output.parent.is_dir():
         raise StudyError(f"the folder {output.parent} for the model file does not exist: make it first")
     described, text = _read(study)
-    read = study_file(study) if isinstance(study, str | Path) else None
-    check_no_input([output], [read, getattr(getattr(described, "mesh", None), "file", None)], StudyError)
+    check_no_input([output], [study_file(study) if isinstance(study, str | Path) else None], StudyError)
     try:
+        check_no_input([output], input_files(described), StudyError)
         return _built(described, text, output, workers, executor)
     except StudyError as error:
         if isinstance(study, str | Path):

@@ -48,10 +48,15 @@ class MaterialSection(Section):
         return dict(self.model_extra or {})
 
     @property
+    def file(self) -> Path | None:
+        """The file of a user's own law; None for others."""
+        function = self.constants.get("function")
+        return Path(function.rpartition(":")[0]) if isinstance(function, str) else None
+
+    @property
     def source(self) -> str:
         """Text of the file of a user's own law; empty for others."""
-        function = self.constants.get("function")
-        path = Path(function.rpartition(":")[0]) if isinstance(function, str) else None
+        path = self.file
         return path.read_text(encoding="utf-8") if path is not None and path.is_file() else ""
 
     def make(self, read: Reader) -> Material:

@@ -6,11 +6,11 @@ another program, and every other one is a solid.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.sections import explain
@@ -19,6 +19,8 @@ from morph_dslam.meshing.mesh_files import load_mesh
 from morph_dslam.meshing.mesh_notes import file_deviation, file_notes
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.studies.external import ExternalStudy
+from morph_dslam.studies.external_table import SolutionTable
+from morph_dslam.studies.material_sections import MaterialSection
 from morph_dslam.studies.set_sections import with_sets
 from morph_dslam.studies.sheet_study import SheetStudy
 from morph_dslam.studies.shell_sections import shell_mesh
@@ -67,6 +69,35 @@ def make_study(content: Mapping[str, Any], folder: str | Path = Path(), where: s
         return kind.model_validate(dict(content), context={"folder": Path(folder)})
     except ValidationError as error:
         raise StudyError(f"{where}: {explain(kind, error, content)}") from error
+
+
+def input_files(study: Study) -> list[Path]:
+    """The files that a study names, and those of its solutions where it has a table of them.
+
+    Raises StudyError if such a table cannot be read.
+    """
+    files = list(_named_files(study))
+    if isinstance(study, ExternalStudy):
+        table = SolutionTable(study.external.table)
+        solutions = [table.path.parent / row["file"] for row in table.rows]
+        files += [*solutions, *(path.with_suffix(".h5") for path in solutions)]  # what XDMF files keep beside them
+    return files
+
+
+def _named_files(part: object) -> Iterator[Path]:
+    """All paths in a part of a study."""
+    if isinstance(part, Path):
+        yield part
+    elif isinstance(part, Mapping):
+        yield from _named_files(tuple(part.values()))
+    elif isinstance(part, list | tuple):
+        for each in part:
+            yield from _named_files(each)
+    elif isinstance(part, BaseModel):
+        if isinstance(part, MaterialSection) and part.file is not None:
+            yield part.file
+        for _, value in part:
+            yield from _named_files(value)
 
 
 def mesh_of_file(path: str | Path, unit: str, size: float | None = None) -> Mesh:
