@@ -371,6 +371,7 @@ def test_bounds_that_hold_no_solution_are_refused():
         ("time_min,Strain_percent,Stress_MPa,note", "0,50,0.6,a", "1,100,0.9,b"),
         ("stress_MPa,stretch", "0.6,1.5", "0.9,2.0"),
         ("time_stamp,TIME_MIN,stretch,stress_MPa", "12:00,0,1.5,0.6", "12:01,1,2.0,0.9"),
+        ("time_stamp,stretch,stress_MPa,time", "12:00,1.5,0.6,", "12:01,2.0,0.9,"),
     ],
 )
 def test_columns_are_read_in_their_units(tmp_path, titles, first, second):
@@ -380,8 +381,10 @@ def test_columns_are_read_in_their_units(tmp_path, titles, first, second):
     np.testing.assert_allclose(read.stretch, [1.5, 2.0])
     np.testing.assert_allclose(read.stress, [0.6e6, 0.9e6])
     assert read.kind == "planar"
-    if "time" in titles.lower():
+    if "time_min" in titles.lower():
         np.testing.assert_allclose(read.time, [0.0, 60.0])
+    else:
+        assert read.time is None
 
 
 @pytest.mark.parametrize(
@@ -400,6 +403,10 @@ def test_columns_are_read_in_their_units(tmp_path, titles, first, second):
         ("stretch;stress_MPa\n1;0\n", "semicolons"),
         ("stretch,stress_MPa,time_s,time_min\n1,0,0,0\n", "several columns of time: time_s, time_min"),
         ("stretch,stress_MPa,stress_MPa\n1,0,0\n", "several columns of stress"),
+        ("stretch,stress_MPa,time_sec\n1,0,0\n2,1,\n", "'time_sec' ends in 'sec', which is no unit of time"),
+        ("Time [us],stretch,stress_MPa\n0,1,0\n1e6,2,1\n", "'Time [us]' ends in 'us', which is no unit of time"),
+        ("time_stamp,stretch,stress_MPa,time_hours\n8:00,1,0,0\n9:00,2,1,1\n", "'time_hours' ends in 'hours'"),
+        ("stretch,stress_MPa,time\n1,0,0\n2,1,1\n", "column 'time' has no unit; name it time_s"),
     ],
 )
 def test_tables_that_cannot_be_are_refused(tmp_path, text, says):

@@ -25,8 +25,8 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
     ``strain [%]`` in percent) and ``stress_MPa`` or ``stress [MPa]`` (force over undeformed section) or
     ``true_stress_MPa`` (over the deformed one), in any unit of stress; and perhaps ``time_s``.
 
-    Other columns are left out, and so are lines with an empty cell in one of these. True stresses are converted for an
-    incompressible solid.
+    Other columns are left out, as time stamps are, and so are lines with an empty cell in one of these. True stresses
+    are converted for an incompressible solid.
 
     Parameters
     ----------
@@ -45,6 +45,8 @@ def load_test(path: str | Path, kind: str = "uniaxial") -> MaterialTest:
     strain = _only(path, titles, [title for title in titles if title in _STRAINS], "stretch or strain")
     stress, true, pascals = _stress_column(path, rows[0][1])
     times = [title for title in rows[0][1] if _is_time(title)]
+    if not times:
+        _check_no_time(path, rows)
     time = [rows[0][1].index(_only(path, times, times, "time"))] if times else []
     columns = [titles.index(strain), stress, *time]
     if wide := [line for line, cells in rows[1:] if any(cells[len(titles) :])]:
@@ -94,6 +96,27 @@ def _is_time(title: str) -> bool:
     """Whether it is one of times with their unit; time_stamp, say, is another column."""
     unit = name_and_unit(title)[1]
     return _splits_into(title, "time") and unit.lower() in FACTORS["time"]
+
+
+def _check_no_time(path: Path, rows: Sequence[tuple[int, list[str]]]) -> None:
+    """Refuse numbers that are times in no known unit: a test without times is taken for one that has relaxed."""
+    for at, title in enumerate(rows[0][1]):
+        if not (title.lower() == "time" or _splits_into(title, "time")):
+            continue
+        cells = [cells[at] for _, cells in rows[1:] if len(cells) > at and cells[at]]
+        if not cells or not all(_is_number(cell) for cell in cells):
+            continue
+        if title.lower() == "time":
+            raise IdentificationError(f"{path}: column 'time' has no unit; name it time_s or time_min say")
+        _factor(path, title, "time")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _factor(path: Path, title: str, quantity: str) -> float:
