@@ -102,3 +102,29 @@ def test_another_origin_is_named_where_points_are_not_aligned() -> None:
     assert each["moved_as_one"]["rms"] == pytest.approx(1e3 * NOISE, rel=0.25)
     assert "give --align-points" in text
     assert doubts(replace(shifted, aligned=True)) == DOUBTS
+
+
+def test_another_origin_is_named_of_points_that_lie_near_each_other() -> None:
+    """A grid of 25 mm on a plate of 1.4 m across, in two states."""
+    table, along = points(), np.arange(0.0, 0.26, 0.025)
+    grid = np.array([[x, y, 0.0] for x in along for y in along])
+    states, load = tuple(f"state {i}" for i in range(2) for _ in grid), np.repeat([0.5, 1.0], len(grid))
+    places, noise = np.tile(grid, (2, 1)), NOISE * np.random.default_rng(0).normal(size=(2 * len(grid), 3))
+    measured = places * (1.0 + np.outer(TRUTH * load, [1.0, 0.0, 0.0])) + noise + [0.0, 0.05, 0.03]
+    each, _ = figures(MeasuredPoints(table.model, states, {"load": load}, places, measured))
+    assert each["moved_as_one"]["rms"] == pytest.approx(1e3 * NOISE, rel=0.1)
+
+
+def test_a_marker_that_is_measured_many_times_in_a_state_is_one() -> None:
+    """Three markers 20 mm beside their places, ten times each in one state."""
+    table = points(2, (0, 1, 2), beside=0.02)
+    first = np.tile(np.arange(3), 10)
+    noise = NOISE * np.random.default_rng(1).normal(size=(30, 3))
+    often = replace(
+        table,
+        states=tuple(table.states[row] for row in first),
+        known={"load": table.known["load"][first]},
+        places=table.places[first],
+        measured=table.measured[first] + noise,
+    )
+    assert doubts(often)["moved_as_one"] is None

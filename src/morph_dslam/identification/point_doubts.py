@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from scipy.stats import qmc
 
@@ -111,12 +109,27 @@ def _moved_as_one(misfit: Misfit, points: MeasuredPoints) -> dict[str, float] | 
 
 
 def _markers(points: MeasuredPoints) -> NDArray[np.int64]:
-    """A label of each row (r,): rows are of one marker where their places are the same but for their own error."""
-    size = float(np.linalg.norm(np.ptp(points.model.nodes, axis=0)))
-    pairs = KDTree(points.places).query_pairs(ONE_PLACE * size, output_type="ndarray")
-    rows = len(points.places)
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(rows, rows))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    """A label of each row (r,): rows are of one marker where their places are the same but for their own error.
+
+    Different places in one state are of different markers, however near.
+    """
+    most = ONE_PLACE * float(np.linalg.norm(np.ptp(points.model.nodes, axis=0)))
+    names, labels = np.array(points.states), np.zeros(len(points.states), dtype=np.int64)
+    known = np.zeros((0, 3))
+    for state in dict.fromkeys(points.states):
+        rows = np.flatnonzero(names == state)
+        places, which = np.unique(points.places[rows], axis=0, return_inverse=True)
+        of_place = np.full(len(places), -1)
+        if len(known):
+            away, nearest = KDTree(known).query(places)
+            order = np.argsort(away, kind="stable")
+            order = order[away[order] <= most]
+            taken = order[np.unique(nearest[order], return_index=True)[1]]  # of several, the nearest
+            of_place[taken] = nearest[taken]
+        others = np.flatnonzero(of_place < 0)
+        of_place[others] = len(known) + np.arange(len(others))
+        known, labels[rows] = np.vstack([known, places[others]]), of_place[which.ravel()]
+    return labels
 
 
 def _left(missed: Array, columns: Array) -> Array:
