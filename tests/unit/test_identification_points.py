@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.identification.identify import identify
 from morph_dslam.identification.measured_points import MeasuredPoints
 from morph_dslam.identification.report import identification_lines, summarise
-from tests.support.edge_plate import CORNERS, plate_of_load
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model.functions import ParameterFunctions
+from tests.support.edge_plate import CORNERS, edge_plate, plate_of_load
 
 LOADS, TRUTH, NOISE = np.array([0.2, 0.4, 0.6, 0.8, 1.0]), 0.3, 2e-3
 TURN = Rotation.from_rotvec([0.2, -0.1, 0.3])
@@ -102,6 +104,46 @@ def test_another_origin_is_named_where_points_are_not_aligned() -> None:
     assert each["moved_as_one"]["rms"] == pytest.approx(1e3 * NOISE, rel=0.25)
     assert "give --align-points" in text
     assert doubts(replace(shifted, aligned=True)) == DOUBTS
+
+
+def warped_plate() -> ReducedModel:
+    """Stretched by a; a load from 0 to 1 moves its corners otherwise in each state, by up to 0.2 m."""
+    load, a = Parameter("load", "ratio", "1", 0.0, 1.0, 0.0), Parameter("a", "ratio", "1", 0.0, 1.0, 0.5)
+    degrees = np.array([[d, 0] for d in range(7)] + [[0, 1]])
+    # The stretch is a = (1 + y) / 2, in the Chebyshev polynomial y = 2 a - 1.
+    coefficients = np.zeros((8, 7))
+    coefficients[[0, 7], 0], coefficients[1:7, 1:] = 0.5, np.eye(6)
+    functions = ParameterFunctions(np.zeros(2), np.ones(2), degrees, coefficients)
+    plate = edge_plate((load, a), functions)
+    shape = 0.05 * np.random.default_rng(5).normal(size=(7, 4, 3))
+    shape[0] = CORNERS * [1.0, 0.0, 0.0]
+    return replace(plate, displacement=SeparatedField(shape, functions), reactions={})
+
+
+def warped_points(n_states: int, shift: float, seed: int = 0, beside: float = 0.0, off: float = 0.0) -> MeasuredPoints:
+    """Corners of that plate in states whose loads are ``off`` by this share, in a frame shifted along y and z, m."""
+    model, rng = warped_plate(), np.random.default_rng(seed)
+    loads = np.linspace(0.0, 1.0, n_states + 2)[1:-1]
+    states, places = tuple(f"state {i}" for i in range(n_states) for _ in CORNERS), np.tile(CORNERS, (n_states, 1))
+    acting = np.clip(loads * (1.0 + off * rng.normal(size=n_states)), 0.0, 1.0)
+    measured = np.vstack([model.positions(np.array([load, TRUTH])) for load in acting])
+    measured += np.tile(beside * rng.normal(size=CORNERS.shape), (n_states, 1))
+    measured += NOISE * rng.normal(size=places.shape) + np.array([0.0, shift, shift])
+    return MeasuredPoints(model, states, {"load": np.repeat(loads, 4)}, places, measured)
+
+
+@pytest.mark.parametrize("n_states", [1, 3, 8])
+def test_another_origin_is_named_with_however_many_states(n_states: int) -> None:
+    """What the loads' errors may do differs between the states: eight of them, and twelve means of four markers."""
+    each, _ = figures(warped_points(n_states, shift=0.05))
+    assert each["moved_as_one"]["rms"] == pytest.approx(1e3 * NOISE, rel=0.6 if n_states == 1 else 0.25)
+
+
+@pytest.mark.slow
+def test_markers_beside_their_places_under_loads_that_are_off_are_no_other_frame() -> None:
+    """By 20 mm and by a twentieth."""
+    raised = [doubts(warped_points(5, 0.0, seed, beside=0.02, off=0.05))["moved_as_one"] for seed in range(20)]
+    assert raised == [None] * 20
 
 
 def test_another_origin_is_named_of_points_that_lie_near_each_other() -> None:

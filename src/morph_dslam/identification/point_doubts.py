@@ -82,30 +82,78 @@ def _moved_as_one(misfit: Misfit, points: MeasuredPoints) -> dict[str, float] | 
     """What is missed once all points are moved as one body; None where that does not leave much less.
 
     The statistic is F, of the means of each marker over the states: markers that are put on the body beside places
-    err in all states alike. What known parameters that are off in each state explain is none of it.
+    err in all states alike. What known parameters that are off in each state explain is none of it, and is taken out
+    of each state first: among the means there is no more room for what a state has of its own.
     """
     if points.aligned or not np.isfinite(points.measured).all():
         return None
-    names = np.array(points.value_states)
-    in_state = [np.where((names == state)[:, None], 1.0, 0.0) for state in dict.fromkeys(points.value_states)]
-    slopes = points.slopes_by_given(misfit.at)
-    null = np.hstack([misfit.slopes, *(slopes * rows for rows in in_state)])
-    both = np.hstack([null, replace(points, aligned=True).loose(misfit.predicted)])
-    without, with_it = (root_mean_square(_left(misfit.missed, columns)) for columns in (null, both))
-    place = _markers(points)
-    mean = np.array([place == each for each in np.unique(place)], dtype=float)
-    mean /= mean.sum(axis=1, keepdims=True)
-    missed, null, both = (
-        np.einsum("pr,rxq->pxq", mean, part.reshape(len(place), 3, -1)).reshape(3 * len(mean), -1)
-        for part in (misfit.missed[:, None], null, both)
+    columns = np.column_stack([misfit.slopes, replace(points, aligned=True).loose(misfit.predicted)])
+    lengths, k = np.linalg.norm(columns, axis=0), misfit.slopes.shape[1]
+    left, means = np.column_stack([misfit.missed, columns]), _MarkerMeans(_markers(points))
+    names, given = np.array(points.states), points.slopes_by_given(misfit.at).reshape(len(points.states), 3, -1)
+    for state in dict.fromkeys(points.states):
+        rows = np.flatnonzero(names == state)
+        values = (3 * rows[:, None] + np.arange(3)).ravel()
+        basis = scaled_directions(given[rows].reshape(len(values), -1))
+        left[values] -= basis @ (basis.T @ left[values])
+        means.take_out(rows, basis)
+    without, with_it = (
+        root_mean_square(_left(left[:, 0], _beyond_rounding(left[:, 1 : 1 + end], lengths[:end])))
+        for end in (k, len(lengths))
     )
-    before, after = (scaled_directions(columns).shape[1] for columns in (null, both))
-    if after == before or len(missed) <= after:
+    mean = means.of(left)
+    null, both = (scaled_directions(_beyond_rounding(mean[:, 1 : 1 + end], lengths[:end])) for end in (k, len(lengths)))
+    freed, freedom = both.shape[1] - null.shape[1], means.freedom(both)
+    if freed < 1 or freedom < 1.0:
         return None
-    sums = [float(np.sum(_left(missed[:, 0], columns) ** 2)) for columns in (null, both)]
+    sums = [float(np.sum((mean[:, 0] - basis @ (basis.T @ mean[:, 0])) ** 2)) for basis in (null, both)]
     least = max(misfit.model_rms, ROUNDING * float(np.abs(points.values).max()))
-    chance = chance_of_better_fit(sums[0], sums[1], after - before, len(missed) - after, least)
+    chance = chance_of_better_fit(sums[0], sums[1], freed, freedom, least)
     return {"rms": points.scale * with_it} if chance < CHANCE and with_it < MOST_LEFT * without else None
+
+
+def _beyond_rounding(columns: Array, lengths: Array) -> Array:
+    """Columns (n, q) without those of which rounding is left of their lengths (q,)."""
+    return columns[:, np.linalg.norm(columns, axis=0) > ROUNDING * lengths]
+
+
+class _MarkerMeans:
+    """Means of each marker's rows, of which something is taken out state by state.
+
+    Parameters
+    ----------
+    labels : (r,) of each row's marker, from 0.
+    """
+
+    def __init__(self, labels: NDArray[np.int64]) -> None:
+        self._labels, self._counts = labels, np.bincount(labels)
+        self._out: list[Array] = []
+
+    def _sums(self, values: Array, rows: NDArray[np.int64] | slice = slice(None)) -> Array:
+        """Of values (3 s, q) of some rows (s,), for each marker (3 p, q)."""
+        sums = np.zeros((len(self._counts), 3 * values.shape[1]))
+        labels = self._labels[rows]
+        np.add.at(sums, labels, values.reshape(len(labels), -1))
+        return sums.reshape(3 * len(sums), -1)
+
+    def of(self, values: Array) -> Array:
+        """The means (3 p, q) of values (3 r, q)."""
+        return self._sums(values) / np.repeat(self._counts, 3)[:, None]
+
+    def take_out(self, rows: NDArray[np.int64], basis: Array) -> None:
+        """Take in that a state's rows (s,) are without what an orthonormal basis (3 s, q) spans."""
+        self._out.append(self._sums(basis, rows))
+
+    def freedom(self, basis: Array) -> float:
+        """What squares of means without an orthonormal basis (3 p, q) come to by markers' errors of unit variance.
+
+        With B of what was taken out, summed over each marker's rows, and D of one over their numbers, errors w of the
+        markers make the means A w, A = 1 - D B B'. This is the trace of A' (1 - Q Q') A with the basis Q.
+        """
+        out = np.hstack(self._out)
+        shares = out / np.repeat(self._counts, 3)[:, None]
+        whole = len(out) - 2.0 * float(np.sum(out * shares)) + float(np.sum((shares.T @ shares) * (out.T @ out)))
+        return whole - float(np.sum((basis - out @ (shares.T @ basis)) ** 2))
 
 
 def _markers(points: MeasuredPoints) -> NDArray[np.int64]:
