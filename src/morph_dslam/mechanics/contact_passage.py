@@ -106,25 +106,12 @@ def passes_through(
     obstacle: RigidObstacle, symbols: ParameterSymbols, surface: ContactSurface, before: Placed, after: Placed
 ) -> bool:
     """Whether points of a surface go through an obstacle between two solutions; ``symbols`` then have ``after``'s."""
-    found = _follow(obstacle, symbols, surface, before, after)
-    symbols.set(after.mu)
-    return found
-
-
-def _follow(
-    obstacle: RigidObstacle, symbols: ParameterSymbols, surface: ContactSurface, before: Placed, after: Placed
-) -> bool:
-    depths, places = [], []
-    for state in (before, after):
-        symbols.set(state.mu)
-        depths.append(_depth(obstacle, symbols))
-        places.append(_reference(obstacle, symbols))
-    depth = min(depths)
+    depth, moved = _depth_and_move(obstacle, symbols, before.mu, after.mu)
     if not depth > 0.0:
         return False
     face, place = _spread(surface, STRIDE * depth)
     begin, end = (surface.at(state.coordinates, face, place) for state in (before, after))
-    travel = np.linalg.norm(end - begin - (places[1] - places[0]), axis=1)
+    travel = np.linalg.norm(end - begin - moved, axis=1)
     far = travel > depth
     if not far.any():
         return False
@@ -133,18 +120,27 @@ def _follow(
     for share in np.linspace(0.0, 1.0, looks + 1):
         symbols.set(before.mu + share * (after.mu - before.mu))
         gaps.append(obstacle.touch(symbols, begin[far] + share * (end - begin)[far]).gap)
+    symbols.set(after.mu)
     outside = np.minimum(gaps[0], gaps[-1]) > -OUTSIDE * depth
     return bool(np.any(outside & (np.min(gaps, axis=0) < -THROUGH * depth)))
 
 
 def travel_in_depths(obstacle: RigidObstacle, symbols: ParameterSymbols, begin: Array, end: Array) -> float:
     """How far an obstacle moves between parameters (d,), over the depth of its core; 0 for one without a core."""
+    depth, moved = _depth_and_move(obstacle, symbols, begin, end)
+    return float(np.linalg.norm(moved)) / depth if depth > 0.0 else 0.0
+
+
+def _depth_and_move(
+    obstacle: RigidObstacle, symbols: ParameterSymbols, begin: Array, end: Array
+) -> tuple[float, Array]:
+    """The lesser depth of a core at parameters (d,) and others, which are set then, and how far it moves (3,), m."""
     depths, places = [], []
     for mu in (begin, end):
         symbols.set(mu)
         depths.append(_depth(obstacle, symbols))
         places.append(_reference(obstacle, symbols))
-    return float(np.linalg.norm(places[1] - places[0])) / min(depths) if min(depths) > 0.0 else 0.0
+    return min(depths), places[1] - places[0]
 
 
 def _depth(obstacle: RigidObstacle, symbols: ParameterSymbols) -> float:
