@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import EvaluationError
 from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import ReducedModel
-from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
+from morph_dslam.model.parameters import parameter_columns, parameter_of_column
 from morph_dslam.units import FACTORS
 
 Array = NDArray[np.float64]

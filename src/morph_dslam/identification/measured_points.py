@@ -16,8 +16,8 @@ from morph_dslam.identification.common_errors import shape_errors
 from morph_dslam.identification.values import Values
 from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import MaterialPoints, Parameter, ReducedModel
-from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
 from morph_dslam.model.parameter_errors import ParameterErrors
+from morph_dslam.model.parameters import parameter_columns, parameter_of_column
 from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.units import FACTORS
 

@@ -21,7 +21,7 @@ from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.mechanics.materials.base import evaluate
 from morph_dslam.model import Parameter
-from morph_dslam.model.reduced_model import state_text
+from morph_dslam.model.parameters import state_text
 
 Array = NDArray[np.float64]
 #: A number, or an expression of parameter symbols.

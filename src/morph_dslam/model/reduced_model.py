@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,66 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morph_dslam.errors import ParameterError, StudyError
+from morph_dslam.model.parameters import Parameter
 from morph_dslam.model.separated import Outside, SeparatedField, check_outside
 from morph_dslam.model.unknown_loads import ElasticEnergy, UnknownLoads
-from morph_dslam.units import from_si, read_quantity
+from morph_dslam.units import read_quantity
 
 Array = NDArray[np.float64]
 #: Values of the parameters: all of them in order (d,), SI, or some by name, SI or texts such as "20 mN"; the others
 #: have their defaults.
 ParameterValues = ArrayLike | Mapping[str, float | str]
-#: Values may pass the end of a range by so much of its width: tables round.
-ROUNDING = 1e-6
 #: Meshes are the same if their nodes differ by less than this share of their coordinates: files round.
 SAME_PLACE = 1e-5
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One coordinate of the parameter box.
-
-    Attributes
-    ----------
-    name : of the parameter.
-    quantity : what it measures, a key of `morph_dslam.units.FACTORS` ("length", "angle", "ratio" ...).
-    unit : in which reports show it.
-    lower : lower end of its range, SI.
-    upper : upper end, SI.
-    default : value of the state that nothing is known about, SI.
-    description : for reports.
-    """
-
-    name: str
-    quantity: str
-    unit: str
-    lower: float
-    upper: float
-    default: float
-    description: str = ""
-
-    def display(self, value: float) -> float:
-        """``value`` (SI) in ``unit``."""
-        return from_si(value, self.unit, self.quantity)
-
-    def text(self, value: float) -> str:
-        """``value`` (SI) for people, with its unit."""
-        return f"{self.display(value):.6g} {self.unit}".removesuffix(" 1")
-
-    @property
-    def range_text(self) -> str:
-        """The range for people, "0 to 20 mm"."""
-        return f"{self.display(self.lower):.6g} to {self.text(self.upper)}"
-
-    def in_range(self, value: float) -> bool:
-        """Whether ``value`` (SI) lies in the range, but for rounding; NaN does not."""
-        slack = ROUNDING * (self.upper - self.lower)
-        return self.lower - slack <= value <= self.upper + slack
-
-
-def state_text(parameters: Sequence[Parameter], mu: ArrayLike) -> str:
-    """A state (d,), SI, for people: "load = 0.015 N, modulus = 3 MPa"."""
-    values = np.atleast_1d(np.asarray(mu, dtype=np.float64))
-    return ", ".join(f"{p.name} = {p.text(value)}" for p, value in zip(parameters, values, strict=True))
 
 
 @dataclass(frozen=True)

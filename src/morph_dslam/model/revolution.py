@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.errors import ModelFileError
 from morph_dslam.model.basis_functions import fourier_basis
 from morph_dslam.model.functions import Functions
-from morph_dslam.model.reduced_model import Parameter, ReducedModel
+from morph_dslam.model.parameters import Parameter
+from morph_dslam.model.reduced_model import ReducedModel
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.tensor_functions import CPFunctions, ProductFunctions
 

@@ -21,7 +21,8 @@ from morph_dslam.errors import ModelFileError, check_kind
 from morph_dslam.io.checksum import begins_with, check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
-from morph_dslam.model.reduced_model import REACTION, Parameter, ReducedModel
+from morph_dslam.model.parameters import Parameter
+from morph_dslam.model.reduced_model import REACTION, ReducedModel
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.model.unknown_loads import ROOT, SecondOrder, UnknownLoads
 from morph_dslam.units import FACTORS

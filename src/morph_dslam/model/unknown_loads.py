@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import ModelFileError
 from morph_dslam.model.functions import Functions, ParameterFunctions
+from morph_dslam.model.parameters import Parameter
 from morph_dslam.model.separated import SeparatedField
 
 if TYPE_CHECKING:
@@ -231,7 +232,7 @@ def with_unknown_loads(model: ReducedModel, work: float | None = None) -> Reduce
     ModelFileError
         If the model has none.
     """
-    from morph_dslam.model.reduced_model import REACTION, Parameter
+    from morph_dslam.model.reduced_model import REACTION
 
     loads = model.unknown_loads
     if loads is None:

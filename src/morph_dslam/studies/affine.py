@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.mechanics.amplitudes import Amplitude
 from morph_dslam.model import Parameter
-from morph_dslam.model.reduced_model import state_text
+from morph_dslam.model.parameters import state_text
 from morph_dslam.units import FACTORS, quantity_of, to_si
 
 Array = NDArray[np.float64]

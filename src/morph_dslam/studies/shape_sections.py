@@ -20,7 +20,7 @@ from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.meshing.mesh_checks import check_size, described_extent, wrong_cells
 from morph_dslam.meshing.meshes import Mesh
 from morph_dslam.model import Parameter
-from morph_dslam.model.reduced_model import state_text
+from morph_dslam.model.parameters import state_text
 from morph_dslam.studies.affine import Affine, read_affine
 from morph_dslam.studies.sections import Length, LengthUnit, Number, Section, SetName, StudyPath
 from morph_dslam.studies.solid_sections import Reader, Value

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import ArgumentError, TrackingError, check_kind
 from morph_dslam.io.text import has_a_cell_for_each, read_csv
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.model.parameter_columns import parameter_columns, parameter_of_column
+from morph_dslam.model.parameters import parameter_columns, parameter_of_column
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.outcomes import TimeOutside
