@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morph_dslam.sources.steady_times import SteadyTimes
+from morph_dslam.sources.live import SteadyTimes
 
 
 def smoothed(received: np.ndarray) -> np.ndarray:

@@ -111,11 +111,11 @@ class Planes:
         return np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2][-1]
 
 
-def find_planes(points: Array, seed: int = 0) -> Planes:
+def find_planes(points: Array) -> Planes:
     """The planes of a map (n, 3), one after the other as long as one holds enough points; few points have none."""
     if len(points) < FEWEST_POINTS:
         return Planes(0.0, np.empty(0, dtype=np.int64), [])
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     distances = KDTree(points).query(points, k=5)[0][:, -1]
     spacing = float(np.median(distances))
     usable = np.flatnonzero(distances <= STRAY * spacing)

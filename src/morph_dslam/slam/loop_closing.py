@@ -27,8 +27,8 @@ from morph_dslam.slam.tracking import Tracker
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-#: Step of the numerical derivatives, and the step at which iterations end.
-DIFFERENCE, LEAST_STEP = 1e-6, 1e-8
+#: Step of the numerical derivatives, and when iterations end: at such a step, or after so many.
+DIFFERENCE, LEAST_STEP, MOST_ITERATIONS = 1e-6, 1e-8, 20
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,7 @@ def _residuals(first: Similarities, second: Similarities, measured: Similarities
     return np.column_stack([turns, left.translations, np.log(left.scales)])
 
 
-def optimise(
-    start: Similarities, edges: Indices, measured: Similarities, with_scale: bool, iterations: int = 20
-) -> Similarities:
+def optimise(start: Similarities, edges: Indices, measured: Similarities, with_scale: bool) -> Similarities:
     """Transforms that agree best with the measured first_from_second of edges; the first one stays.
 
     Parameters
@@ -99,7 +97,7 @@ def optimise(
     """
     n_free = 7 if with_scale else 6
     current = start
-    for _ in range(iterations):
+    for _ in range(MOST_ITERATIONS):
         residuals = _residuals(current[edges[:, 0]], current[edges[:, 1]], measured)
         jacobian = _jacobian(current, edges, measured, residuals, n_free)
         matrix = (jacobian.T @ jacobian).tocsc() + 1e-12 * sparse.identity(

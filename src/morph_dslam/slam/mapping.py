@@ -195,10 +195,10 @@ class Mapper:
         yield
         yield from self._map.keyframes[number].describe(view.grey)
 
-    def adjust_all(self, iterations: int = 20) -> None:
+    def adjust_all(self) -> None:
         """Bundle adjustment of the whole map."""
         none = np.empty(0, dtype=np.int64)
-        problem = gather(self._map, self._camera, self._map.kept_keyframes, none, iterations, self._hold_poses)
+        problem = gather(self._map, self._camera, self._map.kept_keyframes, none, 20, self._hold_poses)
         put_back(self._map, problem, problem.solve())
 
     def complete(self) -> Moves:

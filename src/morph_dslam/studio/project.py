@@ -217,19 +217,18 @@ class Project:
         name = self.choices.get("recording")
         return name if isinstance(name, str) and self.has(name) else None
 
-    def take_recording(self, name: str, reference_frame: int | None = None, is_another: bool = False) -> None:
+    def take_recording(self, name: str, is_another: bool = False) -> None:
         """Track this recording from now on; pairs that were clicked on another one are set aside.
 
         Parameters
         ----------
         name : of the recording.
-        reference_frame : that the start is of, None for the first one.
         is_another : whether it is not the one that had this name before.
         """
         before = self.choices.get("recording")
         if before is not None and (before != name or is_another):
             self.set_aside_pairs()
-        self.choose(recording=name, reference_frame=reference_frame)
+        self.choose(recording=name, reference_frame=None)
 
     def set_aside_pairs(self) -> None:
         """Keep the pairs as those of an earlier recording: their pixels mean nothing in another one."""
