@@ -7,13 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_log
+from morph_dslam.registration.adjusted_keyframes import AdjustedKeyframes, similarity_of_path
 from morph_dslam.registration.increments import moved_pose, moved_similarity, pose_jacobian, similarity_jacobian
-from morph_dslam.registration.keyframe_adjustment import (
-    AdjustedKeyframes,
-    KeyframeAdjustment,
-    KnownPlace,
-    similarity_of_path,
-)
+from morph_dslam.registration.keyframe_adjustment import KeyframeAdjustment, KnownPlace
 from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints, View, camera_from_object
 from morph_dslam.registration.texture import align_patches, carry

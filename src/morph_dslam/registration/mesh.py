@@ -19,15 +19,11 @@ from numpy.typing import NDArray
 from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.registration.adjusted_keyframes import AdjustedKeyframes, similarity_of_path
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.hints import NO_HINTS, Hints
 from morph_dslam.registration.icp import Surface, same_place
-from morph_dslam.registration.keyframe_adjustment import (
-    AdjustedKeyframes,
-    KeyframeAdjustment,
-    KnownPlace,
-    similarity_of_path,
-)
+from morph_dslam.registration.keyframe_adjustment import KeyframeAdjustment, KnownPlace
 from morph_dslam.registration.messages import (
     UNITS,
     Ambiguity,
