@@ -286,7 +286,7 @@ def estimated(model, pictures, depth_weight=None):
 def check_prediction(model, pictures, depth_weight=None):
     found, seen, trackers = estimated(model, pictures, depth_weight)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = RigErrors(trackers, RIG, depth_std=0.0).added(plain, seen, None, [0.0] * len(RIG)).covariance
+    stated = RigErrors(trackers, RIG, [0.0] * len(RIG)).added(plain, seen, None, [0.0] * len(RIG)).covariance
     assert_moved_as_stated(LATER, found.state, stated, trackers[0].estimator.scale)
 
 
@@ -332,15 +332,35 @@ def test_nothing_is_added_where_nothing_is_known(model):
     np.testing.assert_allclose(stated.covariance, found.covariance, atol=1e-12)
 
 
-def test_the_scale_of_a_depth_camera_moves_the_estimate_of_a_rig_as_predicted(model):
-    """All depths of the first camera are 0.2 % too large; parallax holds against them."""
-    _, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
+@pytest.mark.parametrize("camera", [0, 1])
+def test_the_scale_of_a_depth_camera_moves_the_estimate_of_a_rig_as_predicted(model, camera):
+    """All depths of one camera are 0.2 % too large; parallax, and the other's depths, hold against them."""
+    _, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)], depth_weight=2000.0)
     estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
-    front, *others = seen.views
-    count = len(front.points)
-    depths = PointDepths(front.points.in_camera(RIG[0].seen(LATER))[:, 2], np.full(count, 2000.0), 1.0, 1e6)
-    right, wrong = (RigObservations((replace(front, depths=depths.scaled(f)), *others)) for f in (1.0, 1.002))
-    before, after = estimator.fit(right, LATER), estimator.fit(wrong, LATER)
-    plain = replace(before, covariance=np.zeros((9, 9)))
-    stated = RigErrors(trackers, RIG, depth_std=0.002).added(plain, right, None, [0.0] * len(RIG)).covariance
+    views = list(seen.views)
+    views[camera] = replace(views[camera], depths=views[camera].depths.scaled(1.002))
+    before, after = estimator.fit(seen, LATER), estimator.fit(RigObservations(tuple(views)), LATER)
+    plain, stds = replace(before, covariance=np.zeros((9, 9))), [0.0, 0.0]
+    stds[camera] = 0.002
+    stated = RigErrors(trackers, RIG, stds).added(plain, seen, None, [0.0] * len(RIG)).covariance
     assert_moved_as_stated(before.state, after.state, stated, estimator.scale)
+
+
+def test_each_depth_camera_of_a_rig_has_a_scale_of_its_own(model):
+    """Against the scatter of estimates whose cameras' depths are too large or too small by 0.2 %, each by itself."""
+    _, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)], depth_weight=2000.0)
+    estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
+    before = estimator.fit(seen, LATER)
+    away = []
+    for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):  # a factor that is two-valued has the same variance
+        factors = 1.0 + 0.002 * np.array(signs)
+        views = [replace(view, depths=view.depths.scaled(f)) for view, f in zip(seen.views, factors, strict=True)]
+        after = estimator.fit(RigObservations(tuple(views)), LATER).state
+        moves = after.camera_from_object.translation - LATER.camera_from_object.translation
+        away.append([*(after.parameters - LATER.parameters), *moves])
+    plain = replace(before, covariance=np.zeros((9, 9)))
+    stated = RigErrors(trackers, RIG, [0.002, 0.002]).added(plain, seen, None, [0.0] * len(RIG)).covariance
+    rows = np.array([0, 1, 2, 6, 7, 8])
+    scatter = np.sqrt(np.mean(np.square(away), axis=0)) / estimator.scale[rows]
+    deviations = np.sqrt(np.diag(stated))[rows] / estimator.scale[rows]
+    np.testing.assert_allclose(deviations, scatter, atol=0.05 * np.linalg.norm(scatter))

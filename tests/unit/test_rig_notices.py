@@ -8,6 +8,7 @@ import pytest
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.registration.registration import Registration
 from morph_dslam.sources import Frame
+from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import DepthNotUsed, FewPointsAgree
@@ -72,3 +73,20 @@ def test_depth_that_does_not_count_is_named_and_a_camera_beside_one_that_has_dep
         frames[0] = replace(frames[0], depth=depth)
     found = scene.tracker(use_depth=True).track(frames).warning(DepthNotUsed)
     assert found is None if ratio == 0.0 else found is not None and found.ratio == ratio
+
+
+@pytest.mark.parametrize("factor", [1.005, 1.01, 1.02])
+def test_the_scale_of_the_second_cameras_depths_is_not_known_with_that_of_the_first(scene, factor):
+    """What the depths pull is bounded: from half a deviation on the sheet is off by half a millimetre."""
+    rng, middle = np.random.default_rng(0), MODEL.nodes.mean(axis=0)[None]
+    frames = [
+        Frame(0, 0.0, image, np.float32(scale) * sheet_depth(MODEL, part.seen(sheet_state(0.32)), rng))
+        for scale, image, part in zip((1.0, factor), scene.later, RIG, strict=True)
+    ]
+    scale = DepthScale(1.0, 0.003)
+    known = Registration(MODEL, sheet_state(0.3), covariance=np.diag((0.1 * STD) ** 2), depth_scale=scale)
+    rig = RigTracker(MODEL, RIG, known, TrackerOptions(use_depth=True), references=scene.references)
+    found = rig.track(frames)
+    off = found.estimate.state.camera_from_object.apply(middle) - sheet_state(0.32).camera_from_object.apply(middle)
+    assert abs(off[0, 2]) > 0.4e-3
+    assert 0.5 * abs(off[0, 2]) < found.pose_std[5] < 3.0 * abs(off[0, 2])

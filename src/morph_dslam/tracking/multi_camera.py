@@ -149,8 +149,10 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter = new_filter(self.estimator, self.options)
-        depth_std = self.options.depth_scale_std if registration.depth_scale is None else 0.0
-        self._errors = RigErrors(self.trackers, self.cameras, depth_std)
+        depth_stds = [self.options.depth_scale_std] * len(self.cameras)
+        if registration.depth_scale is not None:  # found with the pose, whose covariance holds its error
+            depth_stds[0] = 0.0
+        self._errors = RigErrors(self.trackers, self.cameras, depth_stds)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._sigma_px = FIRST_SIGMA_PX

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.depth import SCALE_STD, PointDepths
-from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.linearization import inverse_of_seen
 from morph_dslam.tracking.measurement import PATCH_WINDOW
@@ -63,10 +62,13 @@ class RigErrors:
     trackers : by camera, each at its one reference view, which knows how its images are off by the error
         factors that are the same for all.
     cameras : of the rig.
-    depth_std : standard deviation of the scale of all depths, a share; zero where the reference state holds it already.
+    depth_stds : by camera, standard deviation of the scale of its depths, a share; zero where the reference state holds
+        that already; by default the usual one. Each depth camera has a scale of its own.
     """
 
-    def __init__(self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera], depth_std: float = SCALE_STD) -> None:
+    def __init__(
+        self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera], depth_stds: Sequence[float] | None = None
+    ) -> None:
         parts = [part for tracker in trackers for part in tracker.reference.parts]
         self._is_known = all(part.error_factors is not None for part in parts)
         self._cameras, self._scale = cameras, trackers[0].estimator.scale
@@ -77,7 +79,7 @@ class RigErrors:
         ]
         self._points = [tracker.reference.points for tracker in trackers]
         self._estimators = [tracker.estimator for tracker in trackers]
-        self._depths = CommonDepthScale(depth_std, self._scale)
+        self._depth_stds = [SCALE_STD] * len(cameras) if depth_stds is None else depth_stds
 
     def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
         """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
@@ -95,7 +97,7 @@ class RigErrors:
         blurred: Sequence[Array | None] | None = None,
         known: Array | None = None,
     ) -> Estimate:
-        """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
+        """The estimate with a covariance that holds both errors, that of motion blur, and those of the depths' scales.
 
         Parameters
         ----------
@@ -123,8 +125,8 @@ class RigErrors:
             if paths is not None:
                 moved = view.systematic.pushed_by_blur(frame, view.chain, gain, paths)
                 covariance = covariance + moved @ moved.T
-        moved = self._moved_by_depths(gain, views)
-        covariance = covariance + np.outer(moved, moved)
+        moved = self._moved_by_depths(hessian, views)
+        covariance = covariance + moved @ moved.T
         if self._is_known:
             pushes = [
                 view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths) for view, frame in both
@@ -133,12 +135,27 @@ class RigErrors:
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
-    def _moved_by_depths(self, gain: Array, views: Sequence[_View]) -> Array:
-        """How one standard deviation of the scale of all depths moves the estimate (d + 6,)."""
-        push, nothing = np.zeros(len(gain)), np.zeros_like(gain)
-        for points, view in zip(self._points, views, strict=True):
-            push += view.chain.T @ self._depths.push(points, view.estimate.state, nothing, view.depths)
-        return gain @ push
+    def _moved_by_depths(self, hessian: Array, views: Sequence[_View]) -> Array:
+        """How the scale of each camera's depths moves the estimate (d + 6, k), to either side.
+
+        By one deviation, and in squares by what the depths are seen to be off. Steps are finite, with what depths count
+        there: the other cameras hold the estimate, so all depths of a camera whose scale is off are far from it, and
+        Huber's cost lets them pull no more than they do.
+        """
+        moved = [np.empty((len(hessian), 0))]
+        for std, points, view in zip(self._depth_stds, self._points, views, strict=True):
+            if view.depths is None or not std:
+                continue
+            state = view.estimate.state
+            ratio = view.depths.ratio_to(points.in_camera(state)[:, 2])
+            off = float(np.hypot(std, 0.0 if ratio is None else ratio - 1.0))
+            now = view.depths.terms(points, state)
+            for factor in (1.0 + off, 1.0 / (1.0 + off)):
+                then = view.depths.scaled(factor).terms(points, state)
+                more = view.chain.T @ (then[1] - now[1]) @ view.chain
+                step = inverse_of_seen(hessian + more, self._scale) @ view.chain.T @ (now[2] - then[2])
+                moved.append(step[:, None] / np.sqrt(2.0))
+        return np.concatenate(moved, axis=1)
 
     def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
         views, first = [], 0
