@@ -8,17 +8,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import morph_dslam as md
 from morph_dslam import TrackerOptions
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.io.landmarks import Landmarks
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.registration import Registration
-from morph_dslam.tracking import still_run
+from morph_dslam.tracking import still_run, track as track_module
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.state import State
+from morph_dslam.tracking.still_notices import PoseAwayFromLandmarks
 from morph_dslam.tracking.still_run import Sharpening, known_state
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state, write_recording
+from tests.support.tracked_rig import placed_objects
 
 MODEL = bent_sheet_model(7, 5)
 #: As a registration at rest has it: parameters known, the pose to so much.
@@ -162,3 +165,57 @@ def test_the_pose_is_not_sharpened_by_next_to_no_frames(sharpened):
     frames_come(tracker, 1)
     replaced(sharpening, tracker)
     assert part.batches == [10, 10]
+
+
+@pytest.fixture(scope="module")
+def bending(tmp_path_factory):
+    """Pictures of a sheet that bends in one pose, and landmarks half a pixel off."""
+    model, folder, bent = bent_sheet_model(22, 16), tmp_path_factory.mktemp("still"), sheet_state(0.1)
+    film, states = SheetFilm(model), [replace(bent, parameters=k * bent.parameters) for k in (1.0, 0.5, 0.0)]
+    write_recording(folder, {number: film.frame(state) for number, state in enumerate(states)}, model)
+    rng = np.random.default_rng(1)
+    nodes = rng.choice(len(model.nodes), 24, replace=False)
+    pixels = CAMERA.project(bent.camera_from_object.apply(model.positions(bent.parameters)[nodes]))
+    pixels += 0.5 * rng.standard_normal(pixels.shape)
+    save_landmarks(folder / "landmarks.csv", Landmarks(model.nodes[nodes], pixels))
+    return {
+        "frames": folder / "frames",
+        "camera": folder / "camera.yaml",
+        "model": folder / "sheet.morph",
+        "landmarks": folder / "landmarks.csv",
+        "tracker": TrackerOptions(pose="still"),
+        "video": False,
+    }
+
+
+STALE = PoseAwayFromLandmarks(40.0, 2.0, 0.5, 3, 90.0)
+
+
+def test_an_estimate_that_rests_on_another_says_what_holds_now(bending):
+    """The landmarks fit in the pose of all frames; those of the estimate before did not."""
+    (part,) = placed_objects(**bending)
+    tracker = part.new_tracker()
+    seen = []
+    for frame in md.open_source(bending["frames"]):
+        tracker.track(frame)
+        seen.append(tracker.last_seen)
+    placed = replace(part.registration, warnings=(*part.registration.warnings, STALE))
+    found = still_run.with_still_pose(replace(part, registration=placed), seen, estimated=20).registration
+    assert not any(isinstance(warning, PoseAwayFromLandmarks) for warning in found.warnings)
+    assert found.facts["pose"] == "one for the whole sequence, from 23 frames"
+    assert found.facts["sigma_px"] == part.registration.facts["sigma_px"]
+
+
+def test_a_live_run_says_what_its_last_estimate_of_the_pose_does(bending, tmp_path, monkeypatch):
+    """What the landmarks alone left open is not said any more."""
+
+    class AtOnce(Sharpening):
+        def tracker(self, frames, current):
+            facts = self.part.registration.facts | {"pose": "from frames"}
+            self.part = replace(self.part, registration=replace(self.part.registration, facts=facts, warnings=(STALE,)))
+            return current
+
+    monkeypatch.setattr(track_module, "Sharpening", AtOnce)
+    summary = md.track(md.TrackOptions(output=tmp_path / "run", live=True, **bending))
+    assert summary["registration"]["pose"] == "from frames"
+    assert [notice for notice in summary["notices"] if notice["kind"] == "pose_away_from_landmarks"]

@@ -89,13 +89,17 @@ class RadialTermEstimated(RegistrationWarning):
     corner_px: float
 
 
+#: All that `still_notices` says.
+STILL_NOTICES = (PoseAwayFromLandmarks, FocalLengthEstimated, RadialTermEstimated)
+
+
 def still_notices(found: StillFit, known: LandmarkTerm | StateTerm, given: Camera) -> Iterator[RegistrationWarning]:
     """What a reader must know of a pose over a sequence, and of the camera's terms.
 
     Parameters
     ----------
     found : the pose and the terms.
-    known : what the registration rests on.
+    known : what the registration rests on that it began with.
     given : the camera as its file has it.
     """
     if isinstance(known, LandmarkTerm):

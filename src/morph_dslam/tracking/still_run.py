@@ -26,7 +26,7 @@ from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyfra
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
-from morph_dslam.tracking.still_notices import still_notices
+from morph_dslam.tracking.still_notices import STILL_NOTICES, still_notices
 from morph_dslam.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ def with_pose(part: PlacedObject, pose: PoseFrom) -> PlacedObject:
 
 
 def with_still_pose(
-    part: PlacedObject, keyframes: Sequence[Keyframe], terms: Sequence[CameraTerm] = (), estimated: bool = False
+    part: PlacedObject, keyframes: Sequence[Keyframe], terms: Sequence[CameraTerm] = (), estimated: int = 0
 ) -> PlacedObject:
     """The object in the one pose that all frames have together, and its camera with the terms asked for.
 
@@ -51,13 +51,15 @@ def with_still_pose(
     part : the object in its reference frame.
     keyframes : where its points were seen.
     terms : of the camera to estimate.
-    estimated : whether the object's registration is such an estimate already, from earlier frames and the landmarks.
+    estimated : from how many earlier frames, beside the landmarks, the object's registration is such an estimate; zero
+        where it is none.
     """
     registration, tracker = part.registration, part.new_tracker()
     assert isinstance(tracker, Tracker)
     names = [parameter.name for parameter in part.model.parameters]
     constant = [names.index(name) for name in part.options.per_sequence]
-    known = _state_term(part, _covariance_of(part)) if estimated else known_state(part)
+    begun_with = known_state(part)
+    known = _state_term(part, _covariance_of(part)) if estimated else begun_with
     problem = StillProblem(
         part.model,
         part.camera,
@@ -71,13 +73,13 @@ def with_still_pose(
         part.depth_scale_std,
     )
     found = fit_still(problem, registration.alternatives)
-    facts = registration.facts | {"pose": f"one for the whole sequence, from {len(keyframes)} frames"}
+    facts = registration.facts | {"pose": f"one for the whole sequence, from {estimated + len(keyframes)} frames"}
     if found.terms:
         facts["camera"] = {term: {"value": value, "std": std} for term, (value, std) in found.terms.items()}
-    warnings = registration.warnings
+    warnings = tuple(w for w in registration.warnings if not isinstance(w, STILL_NOTICES))  # of the estimate before
     if found.decided:
         warnings = tuple(w for w in warnings if not (isinstance(w, Ambiguous) and w.why is Ambiguity.SHAPES))
-    warnings += tuple(still_notices(found, known, part.camera))
+    warnings += tuple(still_notices(found, begun_with, part.camera))
     registration = replace(
         registration, state=found.state, covariance=found.covariance, facts=facts, warnings=warnings, alternatives=()
     )
@@ -163,11 +165,16 @@ class Sharpening(Reregistration):
     Parameters
     ----------
     placed : the object as the run began with it.
+
+    Attributes
+    ----------
+    part : the object in the pose that the present tracker has.
     """
 
     def __init__(self, placed: PlacedObject) -> None:
         super().__init__(placed)
-        self._part, self._estimated = placed, False
+        self.part = placed
+        self._n_estimated = self._n_submitted = 0
         self._seen, self._every, self._count, self._due_at = list[Keyframe](), 1, 0, FIRST_TIME
         self._last_seen: Keyframe | None = None
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="still pose")
@@ -179,15 +186,15 @@ class Sharpening(Reregistration):
         if current.last_seen is not None and current.last_seen is not self._last_seen and not current.jumps:
             self._take(current.last_seen)
         if self._running is not None and self._running.done():
-            self._part, new = self._running.result()
+            self.part, new = self._running.result()
             assert isinstance(new, Tracker)
-            self._running, self._estimated = None, True
+            self._running, self._n_estimated = None, self._n_estimated + self._n_submitted
             self._seen, self._every = [], 1
             new.take_over(current)
             return new
         # After an estimate that took long more frames than those may be there, but few of the new tracker.
         if self._running is None and self._count >= self._due_at and len(self._seen) >= FIRST_TIME:
-            self._due_at = 2 * self._count
+            self._due_at, self._n_submitted = 2 * self._count, len(self._seen)
             self._running = self._executor.submit(self._sharpened, tuple(self._seen))
         return current
 
@@ -200,5 +207,5 @@ class Sharpening(Reregistration):
             self._seen, self._every = self._seen[::2], 2 * self._every
 
     def _sharpened(self, keyframes: Sequence[Keyframe]) -> tuple[PlacedObject, Tracker | RigTracker]:
-        part = with_still_pose(self._part, keyframes, estimated=self._estimated)
+        part = with_still_pose(self.part, keyframes, estimated=self._n_estimated)
         return part, part.new_tracker()

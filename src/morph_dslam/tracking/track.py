@@ -359,11 +359,13 @@ class _Job:
 
     def _write(self, number: int) -> dict[str, Any]:
         """Write the run folder of one object but for its video; returns the summary, empty without a frame."""
-        run, folder, part = self._run, self._folders[number], self._placed[number]
+        run, folder, again = self._run, self._folders[number], self._again[self._placed[number].name]
+        # What the results rest on: live, the one pose is estimated anew while frames come.
+        part = again.part if isinstance(again, Sharpening) else self._placed[number]
         if not len(folder.results):
             return {}
         facts = run_facts(run, number, part, folder.results)
-        notices = [*part.registration.warnings, *self._again[part.name].notices, *map(Remark, self._notes)]
+        notices = [*part.registration.warnings, *again.notices, *map(Remark, self._notes)]
         of_camera = camera_doubts(part.camera) if part.object.scene is None else part.object.scene.camera_notes
         notices += [Remark(note) for note in of_camera]
         deforms, checked = bool(part.model.parameters), None
