@@ -44,6 +44,7 @@ from morph_dslam.registration.scene import View, views_apart
 from morph_dslam.slam.pose import PoseEstimate
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.tracking.anchoring import Anchor, points_on_object
+from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.state import State, moved
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.bent_tube import bent_tube
@@ -167,13 +168,55 @@ def test_a_registration_in_a_map_is_read_as_it_was_saved(tmp_path):
 
 def test_a_registration_in_a_frame_is_read_as_it_was_saved(tmp_path):
     state = State(SHEET.default + 0.01, shifted(0.3))
-    saved = Registration(SHEET, state, 2.0 * np.eye(9), facts={"from": "landmarks"}, warnings=(AtBound("arch"),))
+    other = State(SHEET.default - 0.02, shifted(0.4))
+    saved = Registration(
+        SHEET,
+        state,
+        2.0 * np.eye(9),
+        facts={"from": "landmarks", "depth_scale": {"factor": 0.98, "std": 0.003}},
+        warnings=(AtBound("arch"),),
+        alternatives=(other,),
+        depth_scale=DepthScale(0.98, 0.003),
+    )
     saved.save(tmp_path / "registration.json")
     read = load_registration(tmp_path / "registration.json", SHEET)
     np.testing.assert_array_equal(read.state.parameters, state.parameters)
     np.testing.assert_array_equal(read.state.camera_from_object.matrix, state.camera_from_object.matrix)
     np.testing.assert_array_equal(read.covariance, saved.covariance)
     assert (read.frame, read.facts, read.warnings) == (None, saved.facts, saved.warnings)
+    # Depths are multiplied by the factor, and a pose for all frames is sought from the other states too.
+    assert read.depth_scale == DepthScale(0.98, 0.003)
+    (again,) = read.alternatives
+    np.testing.assert_array_equal(again.parameters, other.parameters)
+    np.testing.assert_array_equal(again.camera_from_object.matrix, other.camera_from_object.matrix)
+
+
+def test_an_earlier_file_without_other_states_is_read(tmp_path):
+    path = tmp_path / "registration.json"
+    Registration(SHEET, State(SHEET.default, shifted(0.3))).save(path)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({key: value for key, value in content.items() if key != "alternatives"}))
+    read = load_registration(path, SHEET)
+    assert (read.alternatives, read.depth_scale) == ((), None)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"depth_scale": {"factor": 0.0, "std": 0.01}},
+        {"depth_scale": {"factor": 1.0, "std": -0.01}},
+        {"depth_scale": {"factor": 1.0}},
+        {"depth_scale": 1.0},
+        {"alternatives": [{"parameters": [0.0], "camera_from_object": np.eye(4).tolist()}]},
+        {"alternatives": [{}]},
+    ],
+)
+def test_damaged_registrations_in_a_frame_are_refused(tmp_path, wrong):
+    path = tmp_path / "registration.json"
+    Registration(SHEET, State(SHEET.default, shifted(0.3))).save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | wrong))
+    with pytest.raises(RegistrationError, match=r"registration\.json"):
+        load_registration(path, SHEET)
 
 
 def test_damaged_registrations_are_refused(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -280,11 +280,13 @@ class Registration:
         """
         content = {**_known(self.facts), "ambiguous": self.ambiguous}
         content["warnings"] = [_known(warning.content()) for warning in self.warnings]
+        if self.depth_scale is not None:
+            content["depth_scale"] = asdict(self.depth_scale)
         if self.map_registration is None:
             return content | {
-                "parameters": self.state.parameters.tolist(),
-                "camera_from_object": self.state.camera_from_object.matrix.tolist(),
+                **_state_content(self.state),
                 "state_covariance": _list(self.covariance),
+                "alternatives": [_state_content(other) for other in self.alternatives],
             }
         placed, axis = self.map_registration.world_from_object, self.axis
         return content | {
@@ -394,6 +396,11 @@ def in_scene(registration: Registration, scene: Scene) -> Registration:
             f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {registration.frame}"
         )
     return replace(registration, scene=scene)
+
+
+def _state_content(state: State) -> dict[str, list]:
+    """A state for JSON."""
+    return {"parameters": state.parameters.tolist(), "camera_from_object": state.camera_from_object.matrix.tolist()}
 
 
 def _list(array: Array | None) -> list | None:

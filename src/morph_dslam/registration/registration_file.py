@@ -23,6 +23,7 @@ from morph_dslam.registration.registration import (
     in_scene,
     registration_in_map,
 )
+from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.state import State
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ LARGEST = 1e20
 OTHER_OBJECT = 0.1
 #: What is no figure for the summary in the file of a registration.
 _NO_FACTS = {"ambiguous", "warnings", "parameters", "camera_from_object", "state_covariance", "world_from_object"}
-_NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "rivals", "keyframes", "map", "model"}
+_NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "rivals", "keyframes", "map", "model", "alternatives"}
 
 
 def load_registration(path: str | Path, model: ReducedModel | None = None, scene: Scene | None = None) -> Registration:
@@ -90,14 +91,22 @@ def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
     warnings = tuple(read_warning(warning) for warning in content["warnings"])
     if "world_from_object" not in content:
         d = len(model.parameters)
-        pose = RigidTransform.from_matrix(_numbers(content["camera_from_object"], (4, 4)))
-        state = State(_numbers(content["parameters"], (d,)), pose)
         covariance = content["state_covariance"]
         if covariance is not None:
             # Without infinity in JSON it is None, here NaN; earlier files have it.
             covariance = np.array(covariance, dtype=np.float64).reshape(d + 6, d + 6)
             covariance = np.where(np.isnan(covariance), np.inf, covariance)
-        return Registration(model, state, covariance, facts=facts, warnings=warnings)
+        # Earlier files have no alternatives.
+        alternatives = tuple(_state(each, d) for each in content.get("alternatives", []))
+        return Registration(
+            model,
+            _state(content, d),
+            covariance,
+            facts=facts,
+            warnings=warnings,
+            alternatives=alternatives,
+            depth_scale=_depth_scale(content.get("depth_scale")),
+        )
     placed = _placed(content)
     found = MapRegistration(placed, _numbers(content["mean_node_m"], (3,)), _optional(content["covariance"], (7, 7)))
     axis = content["axis_of_revolution"]
@@ -106,6 +115,20 @@ def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
     rivals = [Rival(_placed(each), float(each["score"])) for each in content.get("rivals", [])]
     registration = registration_in_map(model, found, _keyframes(content["keyframes"]), facts, warnings, axis)
     return replace(registration, rivals=tuple(rivals))
+
+
+def _state(content: dict[str, Any], n_parameters: int) -> State:
+    pose = RigidTransform.from_matrix(_numbers(content["camera_from_object"], (4, 4)))
+    return State(_numbers(content["parameters"], (n_parameters,)), pose)
+
+
+def _depth_scale(content: dict[str, Any] | None) -> DepthScale | None:
+    if content is None:
+        return None
+    factor, std = _numbers([content["factor"], content["std"]], (2,)).tolist()
+    if not (factor > 0.0 and std >= 0.0):
+        raise ValueError("depth_scale has no positive factor with its std")
+    return DepthScale(factor, std)
 
 
 def _placed(content: dict[str, Any]) -> SimilarityTransform:
