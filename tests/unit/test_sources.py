@@ -1,7 +1,9 @@
 """Frame sources: order, numbering, ranges, layouts of benchmarks, written videos, and registered kinds."""
 
+import json
 import re
 import struct
+from dataclasses import replace
 from datetime import datetime, timedelta
 from types import SimpleNamespace
 
@@ -654,6 +656,15 @@ def test_mistakes_of_a_registered_source_are_named(opened, message, n_before, tm
     assert len(before) == n_before
     if type(opened) is Items:
         assert [frame.index for frame in open_stream(tmp_path / "film.any")] == [0]
+
+
+def test_numbers_of_numpy_become_numbers_that_json_knows():
+    frame = Frame(np.int64(3), np.float32(0.5), grey(0), captured=np.float64(2.5))
+    assert json.dumps([frame.index, frame.timestamp, frame.captured]) == "[3, 0.5, 2.5]"
+    again = replace(frame, index=np.uint8(4), timestamp=np.int64(7))
+    assert json.dumps([again.index, again.timestamp]) == "[4, 7.0]"
+    with pytest.raises(SourceError, match=r"number 1\.5"):
+        Frame(1.5, 0.0, grey(0))
 
 
 def test_a_picture_before_a_short_video_is_whole_and_one_behind_a_preview_may_be_cut_short(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -35,6 +36,11 @@ class Frame:
     depth : (h, w) metres along the optical axis, NaN or 0 where not measured; None without a depth camera
     right : (h, w, 3) uint8, image of the right camera of a stereo pair; None without one
     captured : when a live frame came, seconds of `time.monotonic`; None in a recording
+
+    Raises
+    ------
+    SourceError
+        If the number is not whole.
     """
 
     index: int
@@ -43,6 +49,16 @@ class Frame:
     depth: NDArray[np.float32] | None = None
     right: NDArray[np.uint8] | None = None
     captured: float | None = None
+
+    def __post_init__(self) -> None:
+        # Numbers of numpy become Python's own: JSON, of which streams and summaries are made, knows no others.
+        try:
+            object.__setattr__(self, "index", operator.index(self.index))
+        except TypeError as error:
+            raise SourceError(f"a frame has the number {self.index!r}: give a whole number") from error
+        for name in ("timestamp", "captured"):
+            if isinstance(seconds := getattr(self, name), Real):  # `check_time` refuses others
+                object.__setattr__(self, name, float(seconds))
 
 
 class MissingFrame(Frame):
