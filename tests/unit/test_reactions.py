@@ -2,16 +2,22 @@
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.mechanics.loads import reaction_names, with_reactions
-from morph_dslam.model import Parameter, ReducedModel, SeparatedField
+from morph_dslam.model import Parameter, ReducedModel, SeparatedField, save_model
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.studies.problem import Snapshot
+from morph_dslam.studio.run_files import run_frames
 from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.outcomes import FoundBy, Status
 from morph_dslam.tracking.reactions import Reactions
+from morph_dslam.tracking.result import FrameResult
+from morph_dslam.tracking.run_folder import write_hdf5
+from morph_dslam.tracking.run_results import RunResults
 
 
 def solve(pull, **outputs):
@@ -146,3 +152,24 @@ def test_forces_of_an_unobservable_parameter_spread_by_their_curvature():
     assert top.force.value == pytest.approx([1.0, 0.0, 60.0])
     assert top.force.std == pytest.approx([100.0 * spread, 0.0, 6.0])
     assert top.moment.std == pytest.approx([0.0, 50.0 * spread, 0.0])
+
+
+def test_supports_whose_names_have_a_slash_are_found_again_in_a_run(tmp_path):
+    """Both would be one group of the file, "end", with another in it."""
+    held = held_bar({})
+    names = ("end", "end/left", "100 %", "Träger")
+    reactions = {f"force_{name}": held.reactions["force_top"] for name in names}
+    model = replace(held, reactions=reactions, triangles=np.array([[0, 1, 0]]))
+    run = RunResults(model, reference_frame=0)
+    found = FrameResult(
+        model, Status.TRACKED, estimate_at(0.2, 0.3, np.zeros((2, 2))), FoundBy.FLOW, n_points=2, n_inliers=2
+    )
+    run.add(0, 0.0, found)
+    write_hdf5(tmp_path / "result.h5", run)
+    save_model(tmp_path / "model.morph", model)
+    with h5py.File(tmp_path / "result.h5") as file:
+        assert set(file["reactions"]) == {"end", "end%2Fleft", "100 %25", "Tr%C3%A4ger"}
+    (frame,) = run_frames(tmp_path)
+    assert set(frame["forces"]) == set(names)
+    for force in frame["forces"].values():
+        assert force == pytest.approx([20.0, 0.0, 90.0], rel=1e-6)

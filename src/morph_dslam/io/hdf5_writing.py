@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import h5py
 
@@ -20,6 +21,13 @@ if sys.platform != "win32":
 
 #: What the name of a file ends with until it is complete.
 PARTIAL = ".partial"
+#: What stays as it is in the name of a member; "/" would start another group.
+_PLAIN = " !#$&'()*+,:;=?@[]"
+
+
+def member_name(name: str) -> str:
+    """The name that a group's member has in a file: percent-encoded (RFC 3986); `urllib.parse.unquote` reads it."""
+    return quote(name, safe=_PLAIN)
 
 
 class _Drive(io.FileIO):

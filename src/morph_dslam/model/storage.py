@@ -11,7 +11,7 @@ import re
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 import h5py
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import ModelFileError, check_kind
 from morph_dslam.io.checksum import begins_with, check_checksum, is_other_hdf5, written_with_checksum
 from morph_dslam.io.file_kinds import MESHES, file_kind
+from morph_dslam.io.hdf5_writing import member_name
 from morph_dslam.model.field_storage import names, read_array, read_field, read_group, read_text, write_field
 from morph_dslam.model.parameters import Parameter
 from morph_dslam.model.reduced_model import REACTION, ReducedModel
@@ -94,8 +95,6 @@ def _check_field(
 
 FORMAT = "morph-dslam reduced model"
 VERSION = 3
-#: What stays as it is in the name of a field's group; "/" would start another group.
-_PLAIN = " !#$&'()*+,:;=?@[]"
 
 
 def save_model(path: str | Path, model: ReducedModel) -> None:
@@ -129,11 +128,11 @@ def save_model(path: str | Path, model: ReducedModel) -> None:
         for cell_type, connectivity in model.cells.items():
             file.create_dataset(f"cells/{cell_type}", data=connectivity.astype(np.int32))
         for name, nodes in model.supports.items():
-            file.create_dataset(f"supports/{quote(name, safe=_PLAIN)}", data=nodes.astype(np.int32))
+            file.create_dataset(f"supports/{member_name(name)}", data=nodes.astype(np.int32))
         if model.unknown_loads is not None:
             _write_loads(file.create_group("unknown_loads"), model.unknown_loads)
         for name, field in model.fields.items():
-            write_field(file.create_group(f"fields/{quote(name, safe=_PLAIN)}"), field)
+            write_field(file.create_group(f"fields/{member_name(name)}"), field)
 
 
 def _write_loads(group: h5py.Group, loads: UnknownLoads) -> None:
@@ -142,7 +141,7 @@ def _write_loads(group: h5py.Group, loads: UnknownLoads) -> None:
     group.create_dataset("tractions", data=loads.tractions)
     group.create_dataset("resultants", data=loads.resultants)
     for name, field in loads.responses.items():
-        write_field(group.create_group(f"responses/{quote(name, safe=_PLAIN)}"), field)
+        write_field(group.create_group(f"responses/{member_name(name)}"), field)
     if loads.second_order is not None:
         group.create_dataset("second_order/soft", data=loads.second_order.soft)
         write_field(group.create_group("second_order/displacement"), loads.second_order.displacement)

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import h5py
 import numpy as np
@@ -199,7 +200,7 @@ def _columns(file: h5py.File, names: list[str]) -> dict[str, list[Any]]:
     for name in ("largest_displacement", "largest_von_mises", "residual_rms_px"):
         columns[name] = [_number(value) for value in array(name)] if name in file else unknown
     supports = list(file["reactions"]) if "reactions" in file else []  # type: ignore[arg-type]
-    forces = {name: array(f"reactions/{name}/force") for name in supports}
+    forces = {unquote(name): array(f"reactions/{name}/force") for name in supports}
     columns["forces"] = [
         {name: force[k].tolist() if np.isfinite(force[k]).all() else None for name, force in forces.items()}
         for k in range(len(numbers))

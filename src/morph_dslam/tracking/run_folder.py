@@ -21,7 +21,7 @@ from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import cross_matrix, rotation_log
 from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.folders import clear_run_folder, make_run_folder
-from morph_dslam.io.hdf5_writing import written_hdf5
+from morph_dslam.io.hdf5_writing import member_name, written_hdf5
 from morph_dslam.io.run_states import FORMAT, VERSION
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
 from morph_dslam.io.writing import writing
@@ -179,7 +179,7 @@ def _write_reactions(file: h5py.File, run: RunResults) -> None:
         rows = [lost if one is None else np.array([one.point, *_parts_of(one)]) for one in frames]
         parts = np.moveaxis(np.array(rows), 1, 0)
         for part, values in zip(("point", "force", "force_std", "moment", "moment_std"), parts, strict=True):
-            file[f"reactions/{name}/{part}"] = values
+            file[f"reactions/{member_name(name)}/{part}"] = values
 
 
 def _write_points(file: h5py.File, run: RunResults) -> None:
