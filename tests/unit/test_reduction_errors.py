@@ -184,3 +184,21 @@ def test_of_an_angle_that_begins_again_states_beyond_the_end_are_near():
     expected = np.sqrt((0.5 * near + 0.25) * 1e-6 + (0.5 * (1.0 - near) + 0.25) * 9e-6)
     for degrees in (350.0, -10.0, 710.0):
         assert errors.size_at(np.radians([degrees])) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("constant", [True, False])
+@pytest.mark.parametrize("degrees", [0.0, 5.0, 90.0, 180.0, 359.0])
+def test_what_is_hidden_of_an_angle_does_not_depend_on_where_its_zero_is(degrees, constant):
+    """The surface moves on a circle of 1 mm, the error is 4 mm: all the angle is hidden, half a turn to each side.
+
+    Half a turn moves the surface by 2 mm, where the derivatives say pi mm.
+    """
+    circle, error, amplitude = 2.0 * np.pi, 4e-3, 1e-3
+    functions = CPFunctions((fourier_basis(0.0, circle, 1),), (np.eye(3),), np.eye(3))
+    states, products = circle * (np.arange(12)[:, None] + 0.5) / 12.0, np.diag([0.0, 1.0, 1.0]) * amplitude**2
+    ranges, none = np.array([circle]), np.zeros((12, 3))
+    errors = ReductionErrors(states, none, np.full(12, error), np.zeros(1), ranges, functions, products)
+    left = error**4 / ((circle * amplitude) ** 2 + error**2) ** 2
+    share = 2.0 / np.pi
+    expected = (1.0 - share**2 * (1.0 - left)) * circle**2 / 12.0
+    assert errors.covariance(np.radians([degrees]), np.array([constant])) == pytest.approx(expected, rel=1e-6)

@@ -134,12 +134,13 @@ class ReductionErrors:
     def _hidden(self, mu: Array, sought: NDArray[np.int64], least: float) -> Hidden:
         """What the error, ``least`` as of `_least`, hides of parameters ``sought`` (f,), by number, at a state (d,)."""
         inside = self.functions.nearest_inside(mu)
-        ranges, lower, taken = self.ranges[sought], self.lower[sought], np.append(0, 1 + sought)
+        begins = np.where(self._periodic, inside - 0.5 * self.ranges, self.lower)[sought]
+        ranges, taken = self.ranges[sought], np.append(0, 1 + sought)
         factors = np.append(1.0, ranges)[:, None]
 
         def rows(place: Array) -> Array:
             there = inside.copy()
-            there[sought] = lower + ranges * place
+            there[sought] = begins + ranges * place
             return np.asarray(self.functions.rows(there)[taken] * factors)
 
         return HiddenChanges(rows, self.products, self._places(inside)[sought], least).found()
@@ -185,9 +186,12 @@ class ReductionErrors:
         return found[0], found[1]
 
     def _places(self, mu: Array) -> Array:
-        """Where in its range each parameter is at a state (d,), from 0 to 1."""
-        places = (mu - self.lower) / self.ranges
-        return np.asarray(np.where(self._periodic, places % 1.0, np.clip(places, 0.0, 1.0)))
+        """Where in its range each parameter is at a state (d,), from 0 to 1.
+
+        A periodic one is in the middle: its range, of which the zero is a convention, goes half a turn each way.
+        """
+        places = np.clip((mu - self.lower) / self.ranges, 0.0, 1.0)
+        return np.asarray(np.where(self._periodic, 0.5, places))
 
     @property
     def _periodic(self) -> NDArray[np.bool_]:
