@@ -6,6 +6,7 @@ import trimesh
 
 from morph_dslam.errors import StudyError
 from morph_dslam.meshing.mesh_files import load_mesh
+from morph_dslam.meshing.surface_repair import repaired_surface
 from tests.support.meshes import cell_volumes
 
 BOX = trimesh.creation.box((40.0, 40.0, 40.0)).subdivide()
@@ -24,6 +25,20 @@ def written(path, *parts):
 def test_a_cavity_is_left_out_whichever_way_the_whole_surface_is_turned(tmp_path, all_turned):
     path = written(tmp_path / "hollow.stl", (BOX, all_turned), (BALL, not all_turned))
     assert 1e9 * cell_volumes(load_mesh(path, "mm")).sum() == pytest.approx(BOX.volume - BALL.volume, rel=1e-5)
+
+
+PATCH = trimesh.Trimesh([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize(("beside", "volume"), [(CORE, CORE.volume), (PATCH, 0.0)], ids=["a body", "an open patch"])
+def test_a_hollow_body_inside_out_is_turned_whatever_lies_beside_it(beside, volume):
+    beside = beside.copy().apply_translation([30.0, 0.0, 0.0])
+    parts = [trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), BALL, beside]
+    whole = trimesh.util.concatenate(parts)
+    points, triangles, repairs = repaired_surface(np.asarray(whole.vertices), np.asarray(whole.faces))
+    assert repairs["parts turned inside out"] == 2
+    found = trimesh.Trimesh(points, triangles, process=False).volume
+    assert found == pytest.approx(BOX.volume - BALL.volume + volume, rel=1e-9)
 
 
 def test_a_body_in_a_cavity_faces_outwards_again(tmp_path):

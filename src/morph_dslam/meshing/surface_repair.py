@@ -31,9 +31,10 @@ PROBES = 8
 def repaired_surface(points: Array, triangles: Indices) -> tuple[Array, Indices, dict[str, int]]:
     """A surface that drawing and tracking can rely upon, and what had to be mended.
 
-    Neighbours turn alike and outwards; a part within another one that is turned inwards is a cavity. Where every part
-    is turned the wrong way round, cavities too, all are turned. Parts that cut into each other stay as they are, and so
-    do those that lie within another one and face outwards: whether they are cavities nobody knows.
+    Neighbours turn alike and outwards; a part within another one that is turned inwards is a cavity. Where an outermost
+    part and all that it holds are turned the wrong way round, cavities too, all are turned. Parts that cut into each
+    other stay as they are, and so do those that lie within another one and face outwards: whether they are cavities
+    nobody knows.
 
     Parameters
     ----------
@@ -127,11 +128,13 @@ class SurfacePart:
     faces : (k,) their numbers.
     turn : 1 if they face outwards, -1 inwards, 0 if they bound no volume.
     inner : whether an odd number of other parts hold it, as they hold a cavity.
+    body : number of the outermost part that holds it; its own where none does.
     """
 
     faces: Indices
     turn: int
     inner: bool
+    body: int
 
     @property
     def wrong(self) -> bool:
@@ -144,15 +147,19 @@ def surface_parts(points: Array, triangles: Indices) -> list[SurfacePart]:
     mesh = trimesh.Trimesh(points, triangles, process=False)
     corners, parts = np.asarray(mesh.triangles), _parts(mesh)
     boxes = np.array([(corners[part].min(axis=(0, 1)), corners[part].max(axis=(0, 1))) for part in parts])
-    found = []
+    turns, holders = [], []
     for part, (low, high) in zip(parts, boxes, strict=True):
         a, b, c = np.moveaxis(corners[part] - corners[part].mean(axis=(0, 1)), 1, 0)
         volume = np.sum(a * np.cross(b, c)) / np.linalg.norm(high - low) ** 3
-        around = np.flatnonzero((boxes[:, 0] < low).all(axis=1) & (high < boxes[:, 1]).all(axis=1))
+        turns.append(int(np.sign(volume)) if abs(volume) > 1e-9 else 0)
+        around = np.flatnonzero((boxes[:, 0] < low).all(axis=1) & (high < boxes[:, 1]).all(axis=1)).tolist()
         probes = corners[part[:: -(-len(part) // PROBES)], 0]
-        holders = sum(all(_holds(corners[parts[other]], probe) for probe in probes) for other in around)
-        found.append(SurfacePart(part, int(np.sign(volume)) if abs(volume) > 1e-9 else 0, holders % 2 == 1))
-    return found
+        holders.append([other for other in around if all(_holds(corners[parts[other]], probe) for probe in probes)])
+    depths = [len(others) for others in holders]
+    return [
+        SurfacePart(part, turn, len(others) % 2 == 1, min([number, *others], key=depths.__getitem__))
+        for number, (part, turn, others) in enumerate(zip(parts, turns, holders, strict=True))
+    ]
 
 
 def _holds(corners: Array, point: Array) -> bool:
@@ -166,11 +173,14 @@ def _holds(corners: Array, point: Array) -> bool:
 
 
 def _turn_outwards(mesh: trimesh.Trimesh) -> int:
-    """Turn parts inside out that face inwards and are no cavities, all if all are wrong; how many were turned."""
+    """Turn parts inside out that face inwards and are no cavities, and how many were turned.
+
+    Where an outermost part and all that it holds are wrong, all of these are turned.
+    """
     faces = np.array(mesh.faces)
     parts = surface_parts(np.asarray(mesh.vertices), faces)
-    every = all(part.wrong for part in parts)
-    turned = [part for part in parts if every or (part.wrong and part.turn < 0)]
+    partly_right = {part.body for part in parts if part.turn and not part.wrong}
+    turned = [part for part in parts if part.wrong and (part.turn < 0 or part.body not in partly_right)]
     for part in turned:
         faces[part.faces] = faces[part.faces][:, ::-1]
     mesh.faces = faces
