@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.integrate import quad_vec
 from scipy.stats import t as student
 
@@ -522,6 +523,26 @@ def test_compression_of_a_bar_is_biaxial_tension_and_tells_little_of_its_own():
     by_yeoh, by_mooney = c10 + 2 * c20 * left + 3 * c30 * left**2, 2e5 + 5e4 / pulled
     expected = np.max(np.abs(by_yeoh - by_mooney) / (0.5 * np.abs(by_yeoh + by_mooney)))
     assert spread["uniaxial"] == pytest.approx(expected, rel=0.01)
+
+
+def test_the_picture_of_a_pressed_bar_says_that_its_tension_is_predicted(tmp_path, monkeypatch):
+    """I1 is 4.25 at a stretch of 1/2, and so large at the pull at which l^2 + 2 / l is."""
+    stretch = np.linspace(1.0, 0.5, 20)
+    test = made("uniaxial", stretch, 4e5 * (stretch - stretch**-2))
+    figures, save = [], Figure.savefig
+
+    def kept(self, *arguments, **options):
+        figures.append(self)
+        save(self, *arguments, **options)
+
+    monkeypatch.setattr(Figure, "savefig", kept)
+    write_fit(tmp_path, [fit_candidate("neo_hookean", [test])], [test], "pad")
+    panels = dict(zip(KINDS, figures[0].axes, strict=True))
+    untested = {kind for kind, axes in panels.items() if "not tested" in axes.get_title()}
+    assert untested == {"uniaxial", "planar"}
+    points, curve = (line.get_xdata() for line in panels["uniaxial"].lines)
+    assert [points.min(), points.max()] == [0.5, 1.0]
+    assert [curve.min(), curve.max()] == pytest.approx([0.5, max(np.roots([1.0, 0.0, -4.25, 2.0]).real)], rel=1e-6)
 
 
 def test_one_row_with_a_time_tells_no_relaxation():

@@ -287,7 +287,7 @@ def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) 
     with a Prony series of the instantaneous one: how much relaxes is no question of the kind of test.
     """
     most = largest_invariant(tests)
-    made = {_kind_in_tension(test) for test in tests}
+    made = {kind_in_tension(test) for test in tests}
     spread = {}
     for kind in KINDS:
         if kind in made:
@@ -300,7 +300,7 @@ def untested_spread(fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) 
     return spread
 
 
-def _kind_in_tension(test: MaterialTest) -> str:
+def kind_in_tension(test: MaterialTest) -> str:
     """The kind of tension that strains as a test does: pressing a bar strains it as equal tension in two directions."""
     pressed, pulled = 1.0 - float(np.min(test.stretch)), float(np.max(test.stretch)) - 1.0
     return "biaxial" if test.kind == "uniaxial" and pulled < _RESTING * pressed else test.kind

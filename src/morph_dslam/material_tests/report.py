@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import IdentificationError
 from morph_dslam.io.folders import check_free
 from morph_dslam.io.writing import writing
-from morph_dslam.material_tests.candidates import FittedLaw, recommended, untested_spread
+from morph_dslam.material_tests.candidates import FittedLaw, kind_in_tension, recommended, untested_spread
 from morph_dslam.material_tests.nominal_stress import KINDS, MaterialTest, NominalStress, largest_invariant
 from morph_dslam.material_tests.stability import stretches_up_to
 from morph_dslam.mechanics.materials.library import constant_quantities
@@ -224,28 +224,41 @@ def fit_last_line(figures: Mapping[str, Any]) -> str:
 
 
 def _draw(path: Path, fitted: Sequence[FittedLaw], tests: Sequence[MaterialTest]) -> None:
-    """Measured points and computed curves, a panel for each kind of test; kinds that were not made show the spread."""
+    """Measured points and computed curves, a panel for each kind of test; kinds that were not made show the spread.
+
+    That of a bar that was pressed only shows what is predicted of its tension too.
+    """
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     best = recommended(fitted, tests)
     most = largest_invariant(tests)
     at_once = "" if best.fit.material.prony is None else ", instantaneous"
+    tested = {kind_in_tension(test) for test in tests}
     for place, kind in enumerate(KINDS, start=1):
         axes = figure.add_subplot(1, len(KINDS), place)
         made = [test for test in tests if test.kind == kind]
-        if any(test.time is not None for test in made) and best.fit.material.prony is not None:
+        in_time = best.fit.material.prony is not None and any(test.time is not None for test in made)
+        if in_time:
             _draw_in_time(axes, best, tests, kind)
         else:
-            _draw_over_stretch(axes, fitted, best, made, kind, most)
-        axes.set_title(kind if made else f"{kind} tension, not tested: predicted{at_once}")
+            _draw_over_stretch(axes, fitted, best, made, kind, None if made and kind in tested else most)
+        pressed = "" if kind in tested else " compression" if in_time else " compression; tension not tested: predicted"
+        state = "as the pressed bar" if kind in tested else "not tested"
+        axes.set_title(f"{kind}{pressed}" if made else f"{kind} tension, {state}: predicted{at_once}", fontsize=10)
         axes.set_ylabel("nominal stress, MPa")
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=DPI)
 
 
 def _draw_over_stretch(
-    axes: Axes, fitted: Sequence[FittedLaw], best: FittedLaw, made: Sequence[MaterialTest], kind: str, most: float
+    axes: Axes,
+    fitted: Sequence[FittedLaw],
+    best: FittedLaw,
+    made: Sequence[MaterialTest],
+    kind: str,
+    most: float | None,
 ) -> None:
-    ends = [test.stretch for test in made] or [stretches_up_to(kind, most)]
+    """Over the stretches that were measured, and in tension up to a first invariant of ``most`` where it is given."""
+    ends = [*(test.stretch for test in made), *([] if most is None else [stretches_up_to(kind, most)])]
     low, high = min(1.0, *(e.min() for e in ends)), max(1.0, *(e.max() for e in ends))
     stretch = np.linspace(low, high, 200)
     for test in made:
