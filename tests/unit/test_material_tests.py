@@ -502,6 +502,13 @@ UP, DOWN = np.linspace(1.0, 1.5, 20), np.linspace(1.0, 0.5, 20)
         (np.r_[DOWN, DOWN[::-1]], True),
         (np.r_[UP, UP[:9:-1]], True),
         (np.r_[UP, UP[::-1], DOWN], True),
+        (np.array([1.0, 2.0, 1.5, 1.0]), True),
+        (np.array([1.0, 2.0, 2.0, 2.0, 1.2]), True),
+        (np.array([1.0, 2.0, 1.0, 2.0, 1.0]), True),
+        (np.array([1.0, 1.5, 1.0, 0.5, 1.0, 1.5]), True),
+        (np.array([1.0, 1.0, 1.5, 2.0, 1.0, 0.75, 0.5]), False),
+        (np.array([0.5, 0.75, 1.0, 1.0, 1.5, 2.0]), False),
+        (np.array([2.0, 1.5, 1.0, 0.5]), False),
     ],
 )
 def test_only_what_goes_both_ways_unloads(stretch, returns):

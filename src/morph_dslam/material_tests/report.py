@@ -90,16 +90,24 @@ def _test_figures(test: MaterialTest) -> dict[str, Any]:
 def _returned(stretch: Array) -> float:
     """How far a test goes both up and down in tension, or in compression, over its largest strain.
 
-    A table may begin with the most compressed row, or at any other end: only what goes both ways has gone back. Rows at
-    rest may be where another specimen begins.
+    A table may begin with the most compressed row, or at any other end: only what goes both ways has gone back.
     """
     strain = stretch - 1.0
     back = [0.0]
-    for side in (strain[strain > 0.0], -strain[strain < 0.0]):
+    for side in (_one_side(strain), _one_side(-strain)):
         if len(side):
             up, down = side - np.minimum.accumulate(side), np.maximum.accumulate(side) - side
             back.append(min(float(up.max()), float(down.max())))
     return max(back) / float(np.abs(strain).max())
+
+
+def _one_side(strain: Array) -> Array:
+    """Those of strains (n,) that are above zero (m,), with one zero for each run of other rows before or between them.
+
+    Rows at rest or on the other side that come last may be where another specimen begins.
+    """
+    side = np.trim_zeros(np.maximum(strain, 0.0), "b")
+    return side[(side > 0.0) | np.diff(side > 0.0, prepend=True)]
 
 
 def _law_figures(each: FittedLaw) -> dict[str, Any]:
