@@ -16,15 +16,14 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.registration.landmark_binding import FEWEST_FOR_FIT, BoundLandmarks
 from morph_dslam.registration.messages import NotAtRest
 from morph_dslam.registration.other_values import as_set, plausible_minima
-from morph_dslam.registration.outline_snap import DISTINCT_SHARE, EXCLUDED, distinct_states, shape_distance
+from morph_dslam.registration.outline_snap import EXCLUDED, distinct_states, spread_of_turns, turned_states
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import pose_starts, shape_starts
 from morph_dslam.tracking.covariance import floored_inverse
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, EstimationOptions, State
-from morph_dslam.tracking.other_tilt import SAME_MINIMUM, mirrored_tilt
+from morph_dslam.tracking.other_tilt import mirrored_tilt
 from morph_dslam.tracking.rig import PointsEstimator, RigCamera
-from morph_dslam.tracking.state import pose_increment
 
 Array = NDArray[np.float64]
 #: Least standard deviation of landmarks' pixels that is believed.
@@ -75,23 +74,20 @@ class LandmarkFit:
         """(d + 6, d + 6); a few landmarks that happen to fit well, or that a wrong model fits, are not exact for it."""
         covariance = self.best.covariance * as_set(self.best, self.click_px)
         if _is_shape_known(self.estimator):
-            covariance[-6:, -6:] += self._spread_of_turns()
+            best, variance = self.best, max(self.click_px, self.best.sigma_px) ** 2
+            rises = [(other.state, 2.0 * (other.cost - best.cost) / variance) for other in self.plausible[1:]]
+            covariance[-6:, -6:] += spread_of_turns(self.estimator.model, best.state, rises)
         return covariance
 
-    def _spread_of_turns(self) -> Array:
-        """What other poses that look the same add to the covariance (6, 6) of the pose of an object at rest.
+    @property
+    def others(self) -> tuple[State, ...]:
+        """States beside the best one that landmarks cannot exclude: distinct ones, and turned ones of a known shape.
 
-        They have its surface where the best one has it, as a slender object that is turned about its length.
+        These look the same, and what corrects landmarks may tell them apart.
         """
-        best, aparts, weights = self.best, [np.zeros(6)], [1.0]
-        variance = max(self.click_px, best.sigma_px) ** 2
-        for other in self.plausible[1:]:
-            apart = pose_increment(best.state.camera_from_object, other.state.camera_from_object)
-            is_new = min(float(np.linalg.norm((apart - one)[:3])) for one in aparts) > SAME_MINIMUM
-            if is_new and shape_distance(self.estimator.model, best.state, other.state) <= DISTINCT_SHARE:
-                aparts.append(apart)
-                weights.append(float(np.exp((best.cost - other.cost) / variance)))
-        return (np.array(aparts).T * np.array(weights) / sum(weights)) @ np.array(aparts)
+        model, best, states = self.estimator.model, self.best.state, [one.state for one in self.plausible[1:]]
+        turned = turned_states(model, best, states) if _is_shape_known(self.estimator) else []
+        return (*distinct_states(model, best, states), *(states[row] for row in turned))
 
     @property
     def rms_px(self) -> float:

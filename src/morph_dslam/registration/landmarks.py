@@ -41,7 +41,7 @@ from morph_dslam.registration.messages import (
     UnusualSize,
 )
 from morph_dslam.registration.other_values import values_of_same_shape
-from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states
+from morph_dslam.registration.outline_snap import EXCLUDED, OutlineSnap, distinct_states, spread_of_turns
 from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rig_check import cameras_contradict
@@ -143,9 +143,7 @@ def register_landmarks(
     placed = _Placed(fit.best, fit.covariance, fit.measured, alternatives)
     moved = fit.not_at_rest([] if near is not None else shape_starts(model)) if at_rest else None
     if depth is not None:
-        placed = _by_depth(
-            fit, alternatives, camera.checked_depth(depth, "the depth"), (depth_sigma, depth_scale_std), at_rest
-        )
+        placed = _by_depth(fit, camera.checked_depth(depth, "the depth"), (depth_sigma, depth_scale_std), at_rest)
     elif image is not None:
         placed = _by_outline(fit, placed, undistorted_grey(camera, image))
     facts = _facts(fit, len(alternatives)) | placed.facts
@@ -200,21 +198,19 @@ def _precise(fit: LandmarkFit) -> Estimator:
     return estimator
 
 
-def _by_depth(
-    fit: LandmarkFit,
-    alternatives: tuple[State, ...],
-    depth: NDArray[np.float32],
-    deviations: tuple[float, float],
-    at_rest: bool,
-) -> _Placed:
+def _by_depth(fit: LandmarkFit, depth: NDArray[np.float32], deviations: tuple[float, float], at_rest: bool) -> _Placed:
     """The object along the sight line by the frame's depth (h, w), with its deviations at 1 m and of its scale."""
     # How well the landmarks fit shows how carefully they were set. A few that happen to fit well are no more exact.
     sigma = max(fit.best.sigma_px, fit.click_px) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
     precise = _precise(fit)
-    found, *others = _of_each_tilt(fit, precise, [fit.best.state, *alternatives], sigma, depth, deviations)
+    found, *others = _of_each_tilt(fit, precise, [fit.best.state, *fit.others], sigma, depth, deviations)
     best = found.estimate
     alternatives = distinct_states(precise.model, best.state, [other.estimate.state for other in others])
-    covariance = without_parameters(best.covariance) if at_rest else best.covariance
+    covariance = best.covariance
+    if at_rest:
+        covariance = without_parameters(covariance)
+        rises = [(other.estimate.state, 2.0 * (other.cost - found.cost)) for other in others]
+        covariance[-6:, -6:] += spread_of_turns(precise.model, best.state, rises)
     facts = {"along_the_sight_line": "by depth", "depth_scale": asdict(found.scale)}
     behind = share_behind(precise, best.state, found.scale.corrected(depth), deviations[0])
     return _Placed(best, covariance, None, alternatives, facts=facts, is_corrected=True, behind=behind, by_depth=found)
@@ -252,7 +248,7 @@ def _by_outline(fit: LandmarkFit, placed: _Placed, grey: NDArray[np.uint8]) -> _
     """The object where its outline in the undistorted image (h, w) has it, if that agrees with the landmarks."""
     sigma = max(fit.best.sigma_px, fit.click_px) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
     snap = OutlineSnap(_precise(fit), fit.landmarks.points, fit.landmarks.pixels, sigma, grey)
-    snapped, alternatives, notes = snap.corrected(fit.best, placed.alternatives)
+    snapped, alternatives, notes = snap.corrected(fit.best, fit.others)
     facts = {"corrected_by_outline": snapped is not None}
     if snapped is None:
         return replace(placed, alternatives=alternatives, notes=notes, facts=facts)

@@ -22,8 +22,10 @@ from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.covariance import floored_inverse
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
+from morph_dslam.tracking.other_tilt import SAME_MINIMUM
 from morph_dslam.tracking.outline import Outline, OutlineMeasurement
 from morph_dslam.tracking.outline_weight import LEAST_SPREAD_PX, OutlineBalance
+from morph_dslam.tracking.state import pose_increment
 
 Array = NDArray[np.float64]
 #: How far, pixels, the outline is searched for in turn.
@@ -65,6 +67,36 @@ def distinct_states(model: ReducedModel, best: State, others: Iterable[State]) -
             shapes.append(shape)
             distinct.append(state)
     return tuple(distinct)
+
+
+def turned_states(model: ReducedModel, best: State, others: Sequence[State]) -> list[int]:
+    """Rows of those states that have the surface where the best one has it, and are turned against it and each other.
+
+    A slender object may be turned so about its length.
+    """
+    aparts, rows = [np.zeros(6)], []
+    for row, state in enumerate(others):
+        apart = pose_increment(best.camera_from_object, state.camera_from_object)
+        is_new = min(float(np.linalg.norm((apart - one)[:3])) for one in aparts) > SAME_MINIMUM
+        if is_new and shape_distance(model, best, state) <= DISTINCT_SHARE:
+            aparts.append(apart)
+            rows.append(row)
+    return rows
+
+
+def spread_of_turns(model: ReducedModel, best: State, others: Sequence[tuple[State, float]]) -> Array:
+    """What `turned_states` add to the covariance (6, 6) of the pose of an object whose shape is known.
+
+    Parameters
+    ----------
+    model : of the object.
+    best : the state that explains most.
+    others : further ones, and by what the chi-squared is larger there.
+    """
+    turned = [others[row] for row in turned_states(model, best, [state for state, _ in others])]
+    aparts = [pose_increment(best.camera_from_object, state.camera_from_object) for state, _ in turned]
+    weights, rows = np.exp([-0.5 * rise for _, rise in turned]), np.array(aparts).reshape(-1, 6)
+    return np.asarray((rows.T * weights / (1.0 + weights.sum())) @ rows)
 
 
 @dataclass(frozen=True)
@@ -121,39 +153,50 @@ class OutlineSnap:
         self._sigma, self._grey, self._surface = sigma_px, grey, DrawnSurface.of(estimator.model)
 
     def corrected(
-        self, best: Estimate, alternatives: Sequence[State]
+        self, best: Estimate, others: Sequence[State]
     ) -> tuple[Snap | None, tuple[State, ...], tuple[RegistrationWarning, ...]]:
         """A registration by landmarks as the outline corrects it.
 
         Parameters
         ----------
         best : by the landmarks alone.
-        alternatives : states that they cannot exclude.
+        others : states that they cannot exclude.
 
         Returns
         -------
         found : the corrected one; None where the outline is not believed.
-        alternatives : those that landmarks and outline together cannot exclude.
+        alternatives : distinct ones that landmarks and outline together cannot exclude.
         warnings : why the outline is not believed; none where it is.
         """
-        starts = [(state, state) for state in (best.state, *alternatives)]
+        model, alternatives = self._estimator.model, distinct_states(self._estimator.model, best.state, others)
+        starts = [(state, state) for state in (best.state, *others)]
         snaps = [self.snapped(*start) for start in starts + [(near, best.state) for near in self._beside(best)]]
         seen = [snap for snap in snaps if snap.seen >= LEAST_SEEN]
         if not seen:
-            return None, tuple(alternatives), (OutlineUnseen(max(snap.seen for snap in snaps)),)
+            return None, alternatives, (OutlineUnseen(max(snap.seen for snap in snaps)),)
         exact = [snap for snap in seen if snap.variance <= self._sigma**2]
         if not exact:
             least_px = float(np.sqrt(min(snap.variance for snap in seen)))
-            return None, tuple(alternatives), (OutlineInexact(least_px, self._sigma),)
+            return None, alternatives, (OutlineInexact(least_px, self._sigma),)
         allowed = [snap for snap in exact if snap.chance >= LEAST_CHANCE]
         if not allowed:
             alone_px, beside_px = exact[0].landmarks_px
-            return None, tuple(alternatives), (OutlineContradicts(beside_px, alone_px),)
+            return None, alternatives, (OutlineContradicts(beside_px, alone_px),)
         surest = min(allowed, key=lambda snap: snap.variance)
         rated = sorted(((snap.chi_squared(self._sigma, surest), snap) for snap in allowed), key=lambda each: each[0])
-        (least, first), *others = rated
-        left = [snap.estimate.state for chi_squared, snap in others if chi_squared < least + EXCLUDED]
-        return first, distinct_states(self._estimator.model, first.estimate.state, left), ()
+        (least, first), *rest = rated
+        rises = [(snap.estimate.state, chi_squared - least) for chi_squared, snap in rest]
+        left = [state for state, rise in rises if rise < EXCLUDED]
+        return self._widened(first, rises), distinct_states(model, first.estimate.state, left), ()
+
+    def _widened(self, first: Snap, others: Sequence[tuple[State, float]]) -> Snap:
+        """With what other poses that look the same add where the shape is known."""
+        box, estimate = self._estimator.box, first.estimate
+        if not np.array_equal(box.lower, box.upper):
+            return first
+        covariance = estimate.covariance.copy()
+        covariance[-6:, -6:] += spread_of_turns(self._estimator.model, estimate.state, others)
+        return replace(first, estimate=replace(estimate, covariance=covariance))
 
     def _beside(self, best: Estimate) -> list[State]:
         """States that landmarks hardly tell from the one that they have."""
