@@ -3,14 +3,20 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import shift
+from scipy.ndimage import gaussian_filter, shift
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking.binding import View, view_of
 from morph_dslam.tracking.estimator import State
-from morph_dslam.tracking.measurement import ReferenceAppearance, compare_with_rendering, draw_textured, pack_texture
+from morph_dslam.tracking.measurement import (
+    ReferenceAppearance,
+    Rendering,
+    compare_with_rendering,
+    draw_textured,
+    pack_texture,
+)
 from morph_dslam.tracking.patches import (
     FLOW_WINDOW,
     NEUTRAL,
@@ -178,6 +184,27 @@ def test_places_do_not_depend_on_where_the_reference_view_is_rendered(off_px):
     assert found.valid.sum() > 50
     # All would be off by as much as the rendering if grey levels were whole numbers; the frame is interpolated, too.
     assert np.abs((found.pixels - true)[found.valid].mean(axis=0)).max() < 0.2 * off_px
+
+
+@pytest.mark.parametrize("drift_px", [-6.0, -15.0, 6.0])
+def test_points_that_a_rolling_shutter_moves_out_of_the_picture_are_not_in_sight(drift_px):
+    """Rows that are read later show all of a picture aside: where its windows are in, and only there, it is found."""
+    rng = np.random.default_rng(0)
+    picture = gaussian_filter(rng.normal(size=(200, 300)), 2.0)
+    picture = np.clip(128.0 + 60.0 * picture / picture.std(), 0.0, 255.0)
+    rendering = Rendering(
+        picture.astype(np.float32),
+        picture.astype(np.uint8),
+        np.ones((200, 300), np.float32),
+        np.zeros((200, 300), np.int32),
+    )
+    places = np.column_stack([rng.uniform([9.0, 250.0], [40.0, 290.0], (100, 2)).ravel(), rng.uniform(20, 180, 200)])
+    frame, drift = np.roll(picture, int(drift_px), axis=1).astype(np.uint8), np.tile([drift_px, 0.0], (200, 1))
+    found = compare_with_rendering(frame, rendering, places, np.ones(200, dtype=bool), None, drift)
+    shown = places[:, 0] + drift_px
+    assert not found.visible[(shown < 4.0) | (shown > 295.0)].any()
+    assert found.visible[(shown > 12.0) & (shown < 287.0)].all()
+    assert found.valid.sum() > 0.95 * found.visible.sum()
 
 
 def test_rendering_an_object_outside_the_image_is_empty():

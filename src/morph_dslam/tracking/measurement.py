@@ -271,11 +271,13 @@ def compare_with_rendering(
     ----------
     frame : (h, w) the contrast-normalized frame
     predicted : (p, 2) where the rendering shows the points.
-    visible : (p,) which of them can be seen.
+    visible : (p,) which of them can be seen; their windows are in the picture there.
     offsets : (p, 2) how far from there they are about to be in the frame; None where that is not known.
     drift : (p, 2) how far from there a rolling shutter shows them; None of a global one.
     """
     shown = predicted if drift is None else predicted + drift
+    if drift is not None:  # the window is compared there, too
+        visible = visible & _windows_inside(shown, frame.shape)
     pixels, valid = shown.copy(), np.zeros(len(predicted), dtype=bool)
     spread = np.full(len(predicted), np.inf)
 
@@ -294,6 +296,14 @@ def compare_with_rendering(
     rows = np.flatnonzero(visible & ~valid)
     look_for(rows, shown[rows], CORRECTION_LEVELS)
     return Measurement(pixels, pixels, valid, visible, spread)
+
+
+def _windows_inside(pixels: Array, shape: Sequence[int]) -> NDArray[np.bool_]:
+    """Which points (p, 2) have their window in a picture of this shape, as `compare_patches` has it."""
+    least = PATCH_HALF + 1
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= least) & (pixels < [shape[1] - 1 - least, shape[0] - 1 - least])
+    return np.asarray(inside.all(axis=1))
 
 
 #: Another picture takes a triangle over from the first where it shows that much more area: seams are few, and
