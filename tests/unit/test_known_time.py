@@ -9,14 +9,17 @@ import pytest
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model import Parameter
+from morph_dslam.registration.registration import PosePrior, Registration
+from morph_dslam.sources import Frame
 from morph_dslam.tracking.combinations import check_options, check_times
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.known_values import KnownTime, KnownValues
-from morph_dslam.tracking.outcomes import TimeOutside
+from morph_dslam.tracking.outcomes import Status, TimeOutside
 from morph_dslam.tracking.run_options import TrackOptions
+from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
-from tests.support.rendered_sequence import CAMERA
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
 
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 SHEET = bent_sheet_model(22, 16)
@@ -85,3 +88,15 @@ def test_a_time_that_is_known_is_at_no_bound():
     estimate = estimator.estimate(points, pixels, np.ones(len(points)), truth)
     assert estimate.state.parameters == pytest.approx(truth.parameters, abs=1e-6)
     assert estimate.at_bound.tolist() == [True, False, False]
+
+
+def test_a_hidden_object_is_told_of_the_time_too():
+    """Its place is known by the map, and nothing of it is seen."""
+    film = SheetFilm(SHEET)
+    start = Registration(SHEET, sheet_state(0.1), covariance=np.diag([2e-3, 2e-2, 5e-3] + [3e-3] * 6) ** 2)
+    tracker = Tracker(SHEET, CAMERA, start, reference=film.frame(sheet_state(0.1)))
+    tracker.estimator.known.clock = KnownTime(0, TIME, zero=10.0)
+    place = PosePrior(sheet_state(0.1).camera_from_object, 1e-6 * np.eye(6), np.zeros((6, 0)))
+    result = tracker.track(Frame(1, 3.0, film.blank()), CameraLocalization(place))
+    assert result.status is Status.HIDDEN
+    assert result.warnings == (TimeOutside("hold", "-7 s", "0 to 20 s", is_before=True),)

@@ -80,14 +80,14 @@ def lost_result(
     hypothesis : that is rejected.
     rejection : why.
     placed : the pose by the map, if it is known.
-    warnings : of a lost object.
+    warnings : of the frame.
     """
     is_hidden, (n_points, n_inliers) = placed is not None, hypothesis.counts
     return FrameResult(
         model,
         Status.HIDDEN if is_hidden else Status.LOST,
         rejection=rejection,
-        warnings=() if is_hidden else tuple(warnings),
+        warnings=tuple(warnings),
         pose_from=PoseSource.MAP if is_hidden else PoseSource.NONE,
         pose_prior=placed,
         n_points=n_points,

@@ -428,7 +428,9 @@ class Tracker:
         self.last_doubt_px = 0.0 if rejection is not None else self._view.recovery.doubt(hypothesis)
         if rejection is not None:
             placed = self._placed_by_map(camera)
-            result = lost_result(self.model, hypothesis, rejection, placed, warnings)
+            # Of a hidden object, whose place is known, only what its frame's time says.
+            told = warnings if placed is None else self.estimator.known.warnings
+            result = lost_result(self.model, hypothesis, rejection, placed, told)
         else:
             errors = self._model_errors
             result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings, errors)
