@@ -1,6 +1,14 @@
 """Which files the frame log of a run may replace."""
 
+import json
+
 import pytest
+
+from morph_dslam.tracking.frame_log import FrameLog
+from morph_dslam.tracking.run_folder import RunFolder
+from morph_dslam.tracking.run_results import RunResults
+from tests.support.rendered_sequence import CAMERA
+from tests.support.streamed import held_block_model, tracked_frame, tracked_result
 
 LINE = '{"frame": 3, "timestamp": 0.1, "status": "tracked"}\n'
 NAMED = ("--landmarks", "--model", "--camera")
@@ -53,3 +61,21 @@ def test_a_log_begins_anew(content, command, tmp_path, refused):
     if content is not None:
         log.write_text(content)
     assert "log.jsonl" not in refused(*command, log)
+
+
+def test_an_earlier_log_is_there_until_the_first_frame_and_each_pass_begins_anew(tmp_path):
+    path, model = tmp_path / "log.jsonl", held_block_model()
+    path.write_text(LINE)
+    folder = RunFolder(tmp_path / "run", "block", RunResults(model, reference_frame=0), CAMERA, overwrite=True)
+    log = FrameLog(path, {"block": folder})
+    assert path.read_text() == LINE
+
+    def take(number):
+        tracked = tracked_frame(number, 0.1 * number, block=tracked_result(model, 0.1, 0.002))
+        folder(tracked)
+        log(tracked)
+        return [json.loads(line)["frame"] for line in path.read_text().splitlines()]
+
+    assert [take(7), take(8)] == [[7], [7, 8]]
+    log.start_again()
+    assert take(7) == [7]

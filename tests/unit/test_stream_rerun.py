@@ -161,9 +161,21 @@ def test_an_earlier_recording_is_replaced_only_where_that_is_allowed(tmp_path, r
     )  # fmt: skip
     assert "--overwrite" in message
     assert path.read_bytes() == earlier
+    model = held_block_model()
     with StreamSink([f"rerun:{path}"], overwrite=True) as streams:
+        streams.begin({"run": StreamedObject(model, "block")}, CAMERA)
+    assert path.read_bytes() == earlier, "a run without a frame leaves it"
+    with StreamSink([f"rerun:{path}"], overwrite=True) as streams:
+        streams.begin({"run": StreamedObject(model, "block")}, CAMERA)
+        streams(tracked_frame(0, 0.0, run=lost_result(model)))
+    found = columns(path)
+    np.testing.assert_array_equal(found["/world/objects/block", "triangle_indices"][None], model.triangles)
+
+
+def test_a_recording_that_never_begins_leaves_no_file(tmp_path):
+    with StreamSink([f"rerun:{tmp_path / 'run.rrd'}"]) as streams:
         streams.begin({"run": StreamedObject(held_block_model(), "block")}, CAMERA)
-    assert any(entity.startswith("/world/objects/block") for entity, _ in columns(path))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_places_that_are_none(tmp_path, refused):

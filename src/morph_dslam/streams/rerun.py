@@ -36,7 +36,8 @@ class RerunPublisher:
 
     Parameters
     ----------
-    where : file to write; or address of a viewer, "rerun+http://..."; empty to start one.
+    where : file to write, what it held is gone with the first frame; or address of a viewer, "rerun+http://..."; empty
+        to start one.
 
     Raises
     ------
@@ -46,22 +47,26 @@ class RerunPublisher:
 
     def __init__(self, where: str) -> None:
         self._where, self._recording = where, rr.RecordingStream("morph-dslam")
+        self._file = Path(where) if where and not where.startswith(VIEWER) else None  # until it is begun
         try:
-            if where.startswith(VIEWER):
+            if self._file is not None:
+                _check_file(self._file)
+            elif where:
                 _check_viewer(where)
                 self._recording.connect_grpc(where, default_blueprint=_layout())
-            elif where:
-                Path(where).open("wb").close()  # what is wrong with it is said in Python's words
-                self._recording.save(where, default_blueprint=_layout())
             else:
                 self._recording.spawn(default_blueprint=_layout())
         except (OSError, RuntimeError, ValueError) as error:
-            raise StreamError(f"--stream rerun{where and ':'}{where} cannot be opened: {error}") from error
+            raise self._not_opened(error) from error
         self._scene: SceneMessage | None = None
         self._maps: Maps | None = None
         self._texts: dict[str, str] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="rerun")
         self._waiting: deque[Future[None]] = deque()
+
+    def _not_opened(self, error: Exception) -> StreamError:
+        where = self._where
+        return StreamError(f"--stream rerun{where and ':'}{where} cannot be opened: {error}")
 
     @property
     def place(self) -> str:
@@ -92,7 +97,16 @@ class RerunPublisher:
         self._recording.log(entity, archetype, static=True)
 
     def publish(self, message: FrameMessage) -> None:
-        """Hand a frame to the thread; waits only while it is far behind."""
+        """Hand a frame to the thread; waits only while it is far behind.
+
+        The first one begins the file, also with what was logged before: a run that has none leaves an earlier one.
+        """
+        if self._file is not None:
+            try:
+                self._recording.save(self._file, default_blueprint=_layout())
+            except (OSError, RuntimeError, ValueError) as error:
+                raise self._not_opened(error) from error
+            self._file = None
         if len(self._waiting) >= MOST_WAITING:
             self._waiting.popleft().result()
         self._waiting.append(self._pool.submit(self._log_frame, message))
@@ -154,6 +168,14 @@ class RerunPublisher:
         if self._texts.get(name) != now.text:
             self._texts[name] = now.text
             recording.log(f"status/{name}", rr.TextLog(now.text, level=_LEVELS[now.status]))
+
+
+def _check_file(path: Path) -> None:
+    """OSError unless a file can be written, in Python's words; what it holds stays."""
+    is_there = path.exists()
+    path.open("ab").close()
+    if not is_there:
+        path.unlink()
 
 
 def _check_viewer(address: str) -> None:

@@ -60,7 +60,7 @@ class FrameLog:
 
     Parameters
     ----------
-    path : file to write; what it held is gone: `check_frame_log` says whether it may be.
+    path : file to write; what it held is gone with the first frame: `check_frame_log` says whether it may be.
     folders : by the objects' names, whose last frame is written; in a session's sinks they come first. Where they may
         not replace a run, the log of an earlier one is not replaced either: of a run that was killed it may be all that
         is left.
@@ -79,19 +79,25 @@ class FrameLog:
                 f"the frame log {path} holds an earlier run: name another file, move this one, or allow both it and "
                 f"{first.path} to be replaced (`--overwrite`)"
             )
-        self.start_again()
+        self._is_begun = False
+        with writing(TrackingError, path), path.open("a"):  # what is wrong with it is said at once
+            pass
 
     def start_again(self) -> None:
-        """Empty the file, for another pass over the frames."""
-        with writing(TrackingError, self._path):
-            self._path.write_text("", encoding="utf-8")
+        """Write the frames of another pass in place of those so far."""
+        self._is_begun = False
 
     def __call__(self, tracked: TrackedFrame) -> None:
-        """Write the frame that the run folders have just taken in; of several objects each line has the name."""
+        """Write the frame that the run folders have just taken in; of several objects each line has the name.
+
+        From the first one on, the file takes the place of that of an earlier run.
+        """
         several = len(self._folders) > 1
         lines = [({"object": name} if several else {}) | _line(run.results) for name, run in self._folders.items()]
-        with writing(TrackingError, self._path), self._path.open("a", encoding="utf-8") as file:
+        mode = "a" if self._is_begun else "w"
+        with writing(TrackingError, self._path), self._path.open(mode, encoding="utf-8") as file:
             file.write("".join(json.dumps(line) + "\n" for line in lines))
+        self._is_begun = True
 
 
 def _line(run: RunResults) -> dict[str, Any]:
