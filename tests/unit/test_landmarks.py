@@ -442,9 +442,16 @@ def test_landmarks_of_another_frame_are_not_used_in_this_one(frame):
         with pytest.raises(RegistrationError, match=wanted):
             part.register(
                 [RigCamera(CAMERA, RigidTransform.identity())],
-                Frame(frame, 0.0, np.zeros((4, 4, 3), dtype=np.uint8)),
+                [Frame(frame, 0.0, np.zeros((4, 4, 3), dtype=np.uint8))],
                 landmarks,
             )
+
+
+def test_landmarks_of_several_frames_are_not_used_as_of_one():
+    exact = landmarks()
+    two = Landmarks(exact.points, exact.pixels, np.repeat([2, 9], [4, len(exact.points) - 4]))
+    with pytest.raises(RegistrationError, match="set in frames 2 and 9"):
+        register_landmarks(MODEL, CAMERA, two)
 
 
 def test_landmarks_to_register_anew_are_of_their_frame(tmp_path, refused):

@@ -1,5 +1,7 @@
 """Landmarks in several cameras of a rig: how exactly they place an object, and cameras that contradict each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,11 @@ from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import CamerasContradict, PoorFit
+from morph_dslam.sources import Frame
 from morph_dslam.tracking.rig import RigCamera
+from morph_dslam.tracking.setup import TrackedObject
 from morph_dslam.tracking.state import State
+from morph_dslam.tracking.synchronized import SynchronizedFrames
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 
@@ -112,3 +117,35 @@ def test_a_wrong_landmark_is_named_by_its_camera():
         register_landmarks(
             MODEL, LEFT.camera, first, image=np.zeros((480, 640), np.uint8), others=[(RIGHT, second)]
         )  # fmt: skip
+
+
+class Recording:
+    """One camera's frames at these times; they show nothing."""
+
+    has_assumed_times = False
+    name, fps = "recording", 10.0
+
+    def __init__(self, camera, times):
+        self._image, self._times = np.zeros((camera.height, camera.width, 3), dtype=np.uint8), times
+
+    def __len__(self):
+        return len(self._times)
+
+    def __iter__(self):
+        return iter([Frame(k, time, self._image) for k, time in enumerate(self._times)])
+
+
+def test_landmarks_of_a_further_camera_have_the_numbers_of_its_own_recording():
+    """It begins two frames earlier, and frames go together by their times."""
+    both = [Recording(LEFT.camera, [0.2, 0.3, 0.4]), Recording(RIGHT.camera, [0.0, 0.1, 0.2, 0.3])]
+    frames, rng = SynchronizedFrames(both).at(0), np.random.default_rng(0)
+    first = landmarks(LEFT, bound_points(MODEL, 14, rng), rng)
+    second = landmarks(RIGHT, bound_points(MODEL, 10, rng), rng)
+    other = replace(second, frames=np.full(10, 2))
+    part = TrackedObject("sheet", MODEL, replace(first, frames=np.full(14, 0)), other_landmarks=(other,))
+    placed = part.register((LEFT, RIGHT), frames)
+    expected = register_landmarks(MODEL, LEFT.camera, first, others=[(RIGHT, second)])
+    np.testing.assert_array_equal(placed.state.parameters, expected.state.parameters)
+    wrong = replace(part, other_landmarks=(replace(second, frames=np.full(10, 0)),))
+    with pytest.raises(RegistrationError, match="landmarks of camera 1 that were set in frame 0 are used in frame 2"):
+        wrong.register((LEFT, RIGHT), frames)

@@ -116,8 +116,8 @@ def register_landmarks(
     Raises
     ------
     RegistrationError
-        If there are fewer than 4 landmarks, one lies off the object or outside the image, or no pose and
-        parameters explain them.
+        If there are fewer than 4 landmarks, one lies off the object or outside the image, they were set in several
+        frames, or no pose and parameters explain them.
     ArgumentError
         If model, camera or landmarks are of another kind, or depth or image is given beside others.
     CameraError
@@ -138,6 +138,8 @@ def register_landmarks(
         landmarks = load_landmarks(Path(landmarks))
     cameras = [RigCamera(camera, RigidTransform.identity()), *(part for part, _ in others)]
     given = [landmarks, *(seen for _, seen in others)]
+    for each in given:
+        _check_one_frame(each)
     fit = fit_landmarks(model, cameras, bind_in_cameras(model, cameras, given), click_px, at_rest, near)
     alternatives = distinct_states(model, fit.best.state, [estimate.state for estimate in fit.plausible[1:]])
     placed = _Placed(fit.best, fit.covariance, fit.measured, alternatives)
@@ -161,6 +163,16 @@ def register_landmarks(
         alternatives=placed.alternatives,
         depth_scale=None if placed.by_depth is None else placed.by_depth.scale,
     )
+
+
+def _check_one_frame(landmarks: Landmarks) -> None:
+    """Raise RegistrationError if landmarks say that they were set in several frames."""
+    frames = [] if landmarks.frames is None else np.unique(landmarks.frames).tolist()
+    if len(frames) > 1:
+        raise RegistrationError(
+            f"the landmarks were set in frames {frames[0]} and {frames[1]}, and the object may move between them: give "
+            "those of one frame, or leave out the column of frames if all are of one picture"
+        )
 
 
 @dataclass(frozen=True)

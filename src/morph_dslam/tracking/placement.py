@@ -212,7 +212,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     frames = frames_at(number)
     where = f"frame {frames[0].index} of {run.frames}" if run.reference_image is None else str(run.reference_image)
     camera.check_image(frames[0].image, where)
-    registration, images = part.register(cameras, frames[0]), tuple(frame.image for frame in frames)
+    registration, images = part.register(cameras, frames), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and number in (None, _first_number(run))
     placed = with_loads(registration, part.options)

@@ -49,7 +49,7 @@ class Reregistration:
             return current
         landmarks = next((found for found in [self._at.pop(n) for n in due] if found is not None), None)
         try:
-            registration = replace(part, model=self._placed.model).register(self._placed.cameras, frames[0], landmarks)
+            registration = replace(part, model=self._placed.model).register(self._placed.cameras, frames, landmarks)
             tracker = self._placed.in_frames(registration, frames).new_tracker()
         except RegistrationError as error:
             if due:

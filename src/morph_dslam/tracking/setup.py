@@ -29,6 +29,7 @@ from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
+from morph_dslam.tracking.synchronized import own_number
 from morph_dslam.tracking.views import registered_keyframes
 
 
@@ -79,22 +80,25 @@ class TrackedObject:
         """What finds the object in any frame; None where landmarks or a registration give it in one."""
         return None if isinstance(self.start, Registration | Landmarks) else self.start
 
-    def register(self, cameras: Sequence[RigCamera], frame: Frame, landmarks: Landmarks | None = None) -> Registration:
-        """The object in a frame of the first camera, by these landmarks, or by what it starts from.
+    def register(
+        self, cameras: Sequence[RigCamera], frames: Sequence[Frame], landmarks: Landmarks | None = None
+    ) -> Registration:
+        """The object in the frames of an instant, by camera, by these landmarks, or by what it starts from.
 
         Raises
         ------
         RegistrationError
             If it cannot be registered there.
         """
-        start = landmarks or self.start
+        start, frame = landmarks or self.start, frames[0]
         if isinstance(start, Registration):
             return start
         camera = cameras[0].camera
         if isinstance(start, Landmarks):
-            for landmarks in (start, *(self.other_landmarks if start is self.start else ())):
-                _check_frame(landmarks, frame.index)
             others = list(zip(cameras[1:], self.other_landmarks, strict=False)) if start is self.start else []
+            # Each camera's recording has its own numbers.
+            for number, (each, seen) in enumerate(zip((start, *(seen for _, seen in others)), frames, strict=False)):
+                _check_frame(each, own_number(seen), number)
             # Several cameras show how far away the object is.
             depth = frame.depth if self.options.use_depth and not others else None
             at_rest = self.at_rest and start is self.start
@@ -119,13 +123,14 @@ class TrackedObject:
         return replace(self.options, per_sequence=tuple(names))
 
 
-def _check_frame(landmarks: Landmarks, frame: int) -> None:
-    """Raise RegistrationError if landmarks say that they were set in another frame."""
+def _check_frame(landmarks: Landmarks, frame: int, camera: int = 0) -> None:
+    """Raise RegistrationError if landmarks in a camera of a rig say that they were set in another frame."""
     others = [] if landmarks.frames is None else sorted({*landmarks.frames.tolist()} - {frame})
     if others:
         used = f"frame {frame}" if frame >= 0 else "the reference image"
+        whose = f"landmarks of camera {camera}" if camera else "landmarks"
         raise RegistrationError(
-            f"landmarks that were set in frame {others[0]} are used in {used}: give those of that frame, choose the "
+            f"{whose} that were set in frame {others[0]} are used in {used}: give those of that frame, choose the "
             "other one (--reference-frame), or leave out the column of frames if they belong there"
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields
 from itertools import islice
 
 import numpy as np
@@ -15,6 +15,23 @@ from morph_dslam.tracking.run_notices import RunNotice, RunWarning
 
 #: Clocks that are less apart than this, seconds, go together: an instant has one time by all of them.
 ONE_CLOCK = 1.0
+
+
+@dataclass(frozen=True)
+class RenumberedFrame(Frame):
+    """A frame of a rig that has the number of its instant.
+
+    Attributes
+    ----------
+    own_index : its number in the recording of its camera
+    """
+
+    own_index: int = 0
+
+
+def own_number(frame: Frame) -> int:
+    """The number of a frame in the recording of its camera."""
+    return frame.own_index if isinstance(frame, RenumberedFrame) else frame.index
 
 
 class SynchronizedFrames:
@@ -144,7 +161,7 @@ class SynchronizedFrames:
             is_left_out = now[0] is None and waiting[0] is not None and waiting[0].index <= number
             last = last if is_left_out else number
             frames = tuple(
-                MissingFrame(number, time, image) if frame is None else replace(frame, index=number)
+                MissingFrame(number, time, image) if frame is None else _renumbered(frame, number)
                 for frame, time, image in zip(now, clocks.times(now), blank, strict=True)
             )
             yield frames, is_left_out
@@ -152,6 +169,14 @@ class SynchronizedFrames:
                 old if new is None else next(reader, None)
                 for old, new, reader in zip(waiting, now, readers, strict=True)
             ]
+
+
+def _renumbered(frame: Frame, number: int) -> Frame:
+    """A frame with the number of its instant."""
+    if frame.index == number:
+        return frame
+    own = {each.name: getattr(frame, each.name) for each in fields(Frame)}
+    return RenumberedFrame(**own | {"index": number}, own_index=frame.index)
 
 
 class _Clocks:
