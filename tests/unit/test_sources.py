@@ -13,12 +13,17 @@ import pytest
 from PIL import ExifTags, Image
 
 from morph_dslam import sources
-from morph_dslam.errors import SourceError, TrackingError
+from morph_dslam.camera import Camera
+from morph_dslam.errors import EvaluationError, SourceError, TrackingError
+from morph_dslam.evaluation.depth import read_depths
 from morph_dslam.extend import register_source
+from morph_dslam.io.camera_files import save_camera
 from morph_dslam.io.video import VideoWriter
+from morph_dslam.slam.run import run_slam
 from morph_dslam.sources import Frame, open_live, open_source, open_stream
 from morph_dslam.sources.frames import check_range, notes_of_source, read_image
 from morph_dslam.tracking.combinations import check_depth
+from morph_dslam.tracking.synchronized import SynchronizedFrames
 from tests.support.full_disk import largest_file
 from tests.support.real_data import ROOT, real_data
 
@@ -422,8 +427,23 @@ def test_depth_of_another_clock_says_how_far_it_is_off(tum):
     assert not source.has_registered_depth
     assert source.depth_off_s == pytest.approx(0.5)
     options = SimpleNamespace(use_depth=True)
-    with pytest.raises(TrackingError, match=r"within 20 ms of a frame, the nearest 0\.5 s from one"):
-        check_depth(SimpleNamespace(frames=tum), [SimpleNamespace(options=options)], source)
+    said, run = r"within 20 ms of a frame, the nearest 0\.5 s from one", SimpleNamespace(frames=tum)
+    with open_live(tum) as live:
+        for each in (source, SynchronizedFrames([source, source]), live):
+            with pytest.raises(TrackingError, match=said):
+                check_depth(run, [SimpleNamespace(options=options)], each)
+    with pytest.raises(SourceError, match=said):
+        open_source(tum, depth_per_metre=1000.0)
+    for values_per_metre in (None, 1000.0):
+        with pytest.raises(EvaluationError, match=said):
+            list(read_depths(tum, range(3), values_per_metre))
+
+
+def test_slam_says_that_it_leaves_depth_of_another_clock_aside(tum, tmp_path):
+    (tum / "depth.txt").write_text("1305031102.7433 depth/a.png\n1305031103.2733 depth/b.png\n")
+    save_camera(tmp_path / "camera.yaml", Camera(16, 12, 20.0, 20.0, 8.0, 6.0))
+    told = run_slam(tum, tmp_path / "camera.yaml", tmp_path / "run", video=False, progress=False)
+    assert any("the nearest 0.5 s from one" in flag and "left aside" in flag for flag in told["flags"])
 
 
 def test_hidden_files_beside_images_are_no_images(tmp_path):

@@ -19,8 +19,8 @@ from morph_dslam.evaluation.points import millimetres
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import open_source
-from morph_dslam.sources.frames import DepthScale, has_depth, has_registered_depth, read_depth
-from morph_dslam.sources.recorded import numbered_images
+from morph_dslam.sources.frames import DepthScale, FrameStream, has_depth, has_registered_depth, read_depth
+from morph_dslam.sources.recorded import depth_on_another_clock, numbered_images
 from morph_dslam.surface_distances import distances_to_surface
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def read_depths(
             yield from _from_file(path, wanted)
         elif not path.is_dir():
             raise EvaluationError(f"there are no depth images at {path}")
-        elif values_per_metre is not None and not has_depth(open_source(path)):
+        elif values_per_metre is not None and not _is_recording_with_depth(open_source(path)):
             yield from _from_folder(path, wanted, values_per_metre)
         else:
             yield from _from_recording(path, wanted, values_per_metre)
@@ -90,8 +90,15 @@ def _from_folder(folder: Path, frames: Sequence[int], scale: float) -> Iterator[
             yield frame, read_depth(images[frame], f"frame {frame}", DepthScale(scale))
 
 
+def _is_recording_with_depth(source: FrameStream) -> bool:
+    """Whether a recording has depth images, though perhaps of no frame."""
+    return has_depth(source) or depth_on_another_clock(source, source.name) is not None
+
+
 def _from_recording(path: Path, frames: Sequence[int], scale: float | None) -> Iterator[tuple[int, DepthImage]]:
     source = open_source(path)
+    if doubt := depth_on_another_clock(source, path):
+        raise EvaluationError(doubt)
     if has_depth(source) and not has_registered_depth(source):
         raise EvaluationError(
             f"the depth images of {path} are not registered to the colour camera, so that their pixels show "

@@ -28,6 +28,7 @@ from morph_dslam.slam.slam import Slam
 from morph_dslam.sources import FrameSource, FrameStream, open_source, open_stream
 from morph_dslam.sources.frames import notes_of_source
 from morph_dslam.sources.live import LiveStream
+from morph_dslam.sources.recorded import depth_on_another_clock
 
 #: What a run writes if it is asked for it.
 _VIDEO, _CAMERA = "tracked.mp4", "camera.yaml"
@@ -149,6 +150,8 @@ def run_slam(
             print("preparing (half a minute the first time, when the inner loops are compiled) ...", file=sys.stderr)
         slam, frames = start_slam(stream, one_or_two, options, known, recorded), list[SlamFrame]()
         notes = notes_of_source(stream, slam.camera.readout_s)
+        if options.use_depth and (doubt := depth_on_another_clock(stream, source)):
+            notes += (f"{doubt}; depth was left aside",)
         again: FrameSource | None = None
         n_before = stream.dropped if isinstance(stream, LiveStream) else 0
         try:

@@ -336,6 +336,7 @@ class PacedRecording(LiveStream):
         super().__init__(source.name, source.fps)
         self._source, self._clock, self._sleep = source, clock, sleep
         self.has_registered_depth = has_registered_depth(source)
+        self.depth_off_s = getattr(source, "depth_off_s", None)
         self.has_assumed_times = getattr(source, "has_assumed_times", False)
         self.turned_deg = getattr(source, "turned_deg", 0)
 

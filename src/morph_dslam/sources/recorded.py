@@ -61,6 +61,23 @@ class _ImageRecord:
     right: Path | None = None
 
 
+def depth_on_another_clock(source: object, name: object) -> str | None:
+    """What to mend where none of a source's depth images belongs to a frame by its time; None of all other sources.
+
+    Parameters
+    ----------
+    source : of frames; ``depth_off_s`` says how far the nearest is, seconds.
+    name : by which messages call it.
+    """
+    off = getattr(source, "depth_off_s", None)
+    if off is None:
+        return None
+    return (
+        f"no depth image of {name} was taken within {1e3 * MOST_TIME_DIFFERENCE:g} ms of a frame, the nearest "
+        f"{off:.3g} s from one: put rgb.txt and depth.txt on one clock"
+    )
+
+
 class RecordedFrames:
     """Image files as a `FrameSource`.
 
@@ -126,6 +143,8 @@ class RecordedFrames:
         """
         if not values > 0.0 or not np.isfinite(values):
             raise SourceError(f"depth images cannot have {values:g} values a metre: give 1000 for millimetres")
+        if doubt := depth_on_another_clock(self, self.name):
+            raise SourceError(doubt)
         if self._depth_scale is None or not self.has_registered_depth:
             raise SourceError(
                 f"{self.name} has no depth images that belong to the colour pixels: leave --depth-per-metre out"

@@ -8,7 +8,7 @@ from pathlib import Path
 from morph_dslam.errors import TrackingError
 from morph_dslam.model.shown_field import shown_field
 from morph_dslam.registration.registration import Registration
-from morph_dslam.sources.recorded import MOST_TIME_DIFFERENCE
+from morph_dslam.sources.recorded import depth_on_another_clock
 from morph_dslam.streams.destinations import check_destination
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, NO_MAP, NOT_IN_EQUILIBRIUM
 from morph_dslam.tracking.run_options import ObjectOptions, TrackOptions
@@ -208,13 +208,11 @@ def check_inputs(run: TrackOptions, objects: Sequence[TrackedObject]) -> None:
 
 def check_depth(run: TrackOptions, objects: Sequence[TrackedObject], source: object) -> None:
     """Raise TrackingError if depth images are to be used that the source of frames has not."""
-    off = getattr(source, "depth_off_s", None)
-    if any(part.options.use_depth for part in objects) and off is not None:
-        raise TrackingError(
-            f"no depth image of {run.frames} was taken within {1e3 * MOST_TIME_DIFFERENCE:g} ms of a frame, the "
-            f"nearest {off:.3g} s from one: put rgb.txt and depth.txt on one clock, or track it without --depth"
-        )
-    if any(part.options.use_depth for part in objects) and not getattr(source, "has_registered_depth", False):
+    if not any(part.options.use_depth for part in objects):
+        return
+    if doubt := depth_on_another_clock(source, run.frames):
+        raise TrackingError(f"{doubt}, or track it without --depth")
+    if not getattr(source, "has_registered_depth", False):
         raise TrackingError(
             f"{run.frames} has no depth images that belong to its pixels, as TUM RGB-D recordings have: "
             "track it without --depth"

@@ -111,6 +111,11 @@ class SynchronizedFrames:
         """Whether the first camera's frames come with depth that belongs to their pixels."""
         return getattr(self.sources[0], "has_registered_depth", False)
 
+    @property
+    def depth_off_s(self) -> float | None:
+        """How far the nearest depth image of the first camera is from a frame, seconds, where none belongs to one."""
+        return getattr(self.sources[0], "depth_off_s", None)
+
     def __len__(self) -> int:
         """Number of instants; there are more where no camera has all, and a range counts from frame 0."""
         end = None if self._last is None else self._last + 1
