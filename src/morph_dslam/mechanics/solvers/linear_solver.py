@@ -208,18 +208,16 @@ def default_engine() -> str:
 
 @dataclass(frozen=True)
 class _FreeBlock:
-    """Pattern of K_ff in CSR form, and where its entries lie in the data of K.
+    """Pattern of K_ff in CSR form, of its upper triangle alone if it is symmetric, and where its entries lie in K.
 
     Attributes
     ----------
     order : index into K's data with one zero appended (the diagonals that K does not store).
-    triangular : whether only the upper triangle is kept.
     """
 
     indptr: Integers
     indices: Integers
     order: Integers
-    triangular: bool
 
     @staticmethod
     def of(indices: Integers, indptr: Integers, free: NDArray[np.bool_], symmetric: bool) -> _FreeBlock:
@@ -240,7 +238,7 @@ class _FreeBlock:
         order = np.concatenate([order, np.full(len(missing), len(indices))])
         sorting = np.lexsort((columns, rows))
         starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=size))])
-        return _FreeBlock(starts.astype(np.int32), columns[sorting].astype(np.int32), order[sorting], symmetric)
+        return _FreeBlock(starts.astype(np.int32), columns[sorting].astype(np.int32), order[sorting])
 
     def extract(self, data: Array) -> Matrix:
         size = len(self.indptr) - 1
