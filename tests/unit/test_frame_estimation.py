@@ -16,6 +16,7 @@ from morph_dslam.tracking.frame_starts import (
     a_turn_back,
     at_constant_velocity,
     new_filter,
+    next_start,
     temporal_facts,
     with_unobservable_at_default,
 )
@@ -137,6 +138,19 @@ def test_constant_velocity_repeats_the_last_motion():
     np.testing.assert_allclose(found.parameters, state(3.0).parameters)
     np.testing.assert_allclose(found.camera_from_object.rotation, state(3.0).camera_from_object.rotation, atol=1e-12)
     assert found.camera_from_object.translation[1] == pytest.approx(0.06)
+
+
+def test_neither_a_turn_back_nor_a_step_to_the_default_is_a_velocity():
+    """The angle grew by 0.1 to its bound, and the arch by a millimetre; nothing shows the twist."""
+    model, name = bent_sheet_model(22, 16), PARAMETERS[1].name
+    covariance = np.diag([1e-8, 1e-8, 1.0, *[1e-8] * 6])
+    last = State(np.array([0.020, 2.0 * np.pi, 0.1]), POSE)
+    estimate = replace(determined(model), state=last, covariance=covariance, at_bound=np.array([False, True, False]))
+    before = State(np.array([0.019, 2.0 * np.pi - 0.1, 0.0]), POSE)
+    ahead = next_start(estimate, before, model, TrackerOptions(start="constant-velocity"), (name,))
+    np.testing.assert_allclose(ahead.parameters, [0.021, 0.1, model.default[2]], atol=1e-12)
+    there = next_start(estimate, before, model, TrackerOptions(), (name,))
+    np.testing.assert_allclose(there.parameters, [0.020, 0.0, model.default[2]], atol=1e-12)
 
 
 def test_constant_velocity_keeps_rotations_rotations():

@@ -90,3 +90,28 @@ def test_the_scale_of_the_second_cameras_depths_is_not_known_with_that_of_the_fi
     off = found.estimate.state.camera_from_object.apply(middle) - sheet_state(0.32).camera_from_object.apply(middle)
     assert abs(off[0, 2]) > 0.4e-3
     assert 0.5 * abs(off[0, 2]) < found.pose_std[5] < 3.0 * abs(off[0, 2])
+
+
+@pytest.mark.parametrize("start", ["previous", "constant-velocity"])
+def test_frames_of_a_rig_start_where_the_common_states_lead_to(scene, monkeypatch, start):
+    """In each camera's frame, as the cameras stand to each other; after a loss the object has no velocity."""
+    rig, told = scene.tracker(start=start), [[], []]
+    for camera, own in zip(rig.trackers, told, strict=True):
+
+        def go_on(state, start=None, own=own, go_on=camera.continue_from):
+            own.append(state if start is None else start)
+            go_on(state, start)
+
+        monkeypatch.setattr(camera, "continue_from", go_on)
+    blank = np.full_like(scene.later[0], 120)
+    last, *lost, again = [rig.track(frames) for frames in (scene.later, [blank] * 2, [blank] * 2, scene.later)]
+    assert [result.tracked for result in (last, *lost, again)] == [True, False, False, True]
+    for result, before, number in ((last, sheet_state(0.3), 0), (again, again.estimate.state, 1)):
+        now = result.estimate.state
+        going = 0.0 if start == "previous" else 1.0
+        parameters = now.parameters + going * (now.parameters - before.parameters)
+        shift = now.camera_from_object.translation - before.camera_from_object.translation
+        for part, own in zip(RIG, told, strict=True):
+            np.testing.assert_allclose(own[number].parameters, parameters, atol=1e-9)
+            position = part.camera_from_rig.apply(now.camera_from_object.translation + going * shift)
+            np.testing.assert_allclose(own[number].camera_from_object.translation, position, atol=1e-9)

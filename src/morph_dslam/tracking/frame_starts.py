@@ -75,6 +75,26 @@ class ShapeSearch:
         return [replace(state, parameters=np.where(free, row, inside)) for row in drawn]
 
 
+def next_start(
+    estimate: Estimate, before: State, model: ReducedModel, options: TrackerOptions, angles: Sequence[str]
+) -> State:
+    """Where the estimate of the frame after one starts.
+
+    Parameters
+    ----------
+    estimate : of the one.
+    before : the state in the frame before it; its own where that is not known, after a loss.
+    model : of the object.
+    options : of which ``start`` counts.
+    angles : parameters, by name, that are the angle about an axis of revolution.
+    """
+    ahead = estimate
+    if options.start == "constant-velocity":
+        ahead = replace(estimate, state=at_constant_velocity(before, estimate.state))
+    # Last, for neither a turn nor a step to the default is a velocity.
+    return a_turn_back(model, with_unobservable_at_default(model, ahead), estimate, angles)
+
+
 def with_unobservable_at_default(model: ReducedModel, estimate: Estimate) -> State:
     """The estimated state with unobservable parameters put back to their default.
 

@@ -20,7 +20,7 @@ from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX,
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_results import warnings_of_place, with_flat_sides, with_model_errors
-from morph_dslam.tracking.frame_starts import new_filter
+from morph_dslam.tracking.frame_starts import new_filter, next_start
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, TrackerOptions
@@ -156,6 +156,7 @@ class RigTracker:
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._sigma_px = FIRST_SIGMA_PX
+        self._angles, self._last = registration.per_sequence, registration.state if in_sequence else None
 
     @property
     def state(self) -> State:
@@ -202,6 +203,7 @@ class RigTracker:
         prior = None if known is None or has_moved else self._prior(known, results)
         with frame_clock(STAGES) as clock, stage("fuse"):
             estimate, measured, rejection = self._together(results, prior)
+            self._go_on_from(estimate, _is_recovery(results))
             left: list[Unexplained] = []
             if estimate is not None:
                 estimate, left = self._with_errors(estimate, measured, prior)
@@ -223,10 +225,7 @@ class RigTracker:
             modulus_std=self.options.modulus_std,
         )
         if estimate is None:
-            self._filter.go_on()
             return result
-        for tracker, part in zip(self.trackers, self.cameras, strict=True):
-            tracker.continue_from(part.seen(estimate.state))
         result = replace(result, pose_from=PoseSource.POINTS if prior is None else PoseSource.POINTS_AND_MAP)
         return self._found(result, estimate, measured, results, left)
 
@@ -249,6 +248,20 @@ class RigTracker:
             seen = CameraLocalization(None if known is None else part.seen_pose(known))
             results.append(tracker.track(frame, seen, None if occluder_depths is None else occluder_depths[number]))
         return results
+
+    def _go_on_from(self, estimate: Estimate | None, recovered: bool) -> None:
+        """Tell each camera what all of them found, None if nothing, and what the next frame starts from.
+
+        After a loss, which ``recovered`` says, no frame before tells of a velocity.
+        """
+        before = None if recovered else self._last
+        self._last = None if estimate is None else estimate.state
+        if estimate is None:
+            self._filter.go_on()
+            return
+        start = next_start(estimate, before or estimate.state, self.model, self.options, self._angles)
+        for tracker, part in zip(self.trackers, self.cameras, strict=True):
+            tracker.continue_from(part.seen(estimate.state), part.seen(start))
 
     def _with_errors(
         self, estimate: Estimate, measured: RigObservations, prior: Prior | None
@@ -273,7 +286,6 @@ class RigTracker:
     ) -> FrameResult:
         """A result of the common estimate, in place of the one that would stand without it."""
         used = measured.weights > 0.0
-        recovered = all(result.recovered or result.estimate is None for result in results)
         refuted = _refuted(results)  # what a wrong sensor leaves is no one else's fault
         found = replace(
             lost,
@@ -289,7 +301,7 @@ class RigTracker:
             unexplained_px=max(rest.px for rest in left),
             status=Status.TRACKED,
             estimate=estimate,
-            found_by=FoundBy.LAST_STATE if recovered else FoundBy.FLOW,
+            found_by=FoundBy.LAST_STATE if _is_recovery(results) else FoundBy.FLOW,
             n_inliers=int(used.sum()),
             residual_rms_px=float(np.sqrt(np.mean(np.sum(estimate.residuals[used] ** 2, axis=1)))),
         )
@@ -361,6 +373,11 @@ def _ignored(results: list[FrameResult], measured: RigObservations) -> list[Came
         elif not view.weights.any():
             found.append(CameraIgnored(number, result.status))
     return found
+
+
+def _is_recovery(results: list[FrameResult]) -> bool:
+    """Whether all cameras that found the object had lost it."""
+    return all(result.recovered or result.estimate is None for result in results)
 
 
 def _number_and_time(frames: Sequence[Frame | NDArray[np.uint8] | None]) -> tuple[int | None, float | None]:

@@ -35,13 +35,7 @@ from morph_dslam.tracking.frame_results import (
     with_flat_sides,
     with_model_errors,
 )
-from morph_dslam.tracking.frame_starts import (
-    FrameGaps,
-    a_turn_back,
-    at_constant_velocity,
-    new_filter,
-    with_unobservable_at_default,
-)
+from morph_dslam.tracking.frame_starts import FrameGaps, new_filter, next_start
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.measurement import FOLLOWED_A_UNKNOWN, LEAST_FOLLOWED, MOST_FOLLOWED, Followed
 from morph_dslam.tracking.noise import middle
@@ -479,9 +473,15 @@ class Tracker:
         """Take in where another tracker found the surface open up to this frame."""
         self._jumps_before = tuple(jumps)
 
-    def continue_from(self, state: State) -> None:
-        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost."""
-        self._last = self._start = state
+    def continue_from(self, state: State, start: State | None = None) -> None:
+        """Go on from a state of the last frame that is known better from elsewhere, also when it is lost.
+
+        Parameters
+        ----------
+        state : in the last frame.
+        start : where the next frame's estimate starts; by default there.
+        """
+        self._last, self._start = state, start or state
         self._history.replace_last(state)
         if self._views is not None:
             self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
@@ -564,9 +564,7 @@ class Tracker:
         self._last = estimate.state
         self._history.add(self._last)
         angles = self._registration.per_sequence
-        self._start = a_turn_back(self.model, with_unobservable_at_default(self.model, estimate), estimate, angles)
-        if self.options.start == "constant-velocity":
-            self._start = at_constant_velocity(self._velocity_base, self._start)
+        self._start = next_start(estimate, self._velocity_base, self.model, self.options, angles)
         self._supported = inliers
         self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
