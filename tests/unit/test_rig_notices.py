@@ -11,7 +11,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.options import TrackerOptions
-from morph_dslam.tracking.outcomes import DepthNotUsed, FewPointsAgree
+from morph_dslam.tracking.outcomes import DepthNotUsed, FewPointsAgree, ReadoutNotUsed
 from morph_dslam.tracking.rig import RigCamera
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_depth, sheet_state
@@ -115,3 +115,37 @@ def test_frames_of_a_rig_start_where_the_common_states_lead_to(scene, monkeypatc
             np.testing.assert_allclose(own[number].parameters, parameters, atol=1e-9)
             position = part.camera_from_rig.apply(now.camera_from_object.translation + going * shift)
             np.testing.assert_allclose(own[number].camera_from_object.translation, position, atol=1e-9)
+
+
+def rolling(scene, times):
+    """The rig with cameras that take 30 ms to read their rows out, and its results in both instants."""
+    cameras = [RigCamera(replace(part.camera, readout_s=0.03), part.camera_from_rig) for part in RIG]
+    known = Registration(MODEL, sheet_state(0.3), covariance=np.diag(STD**2))
+    rig = RigTracker(MODEL, cameras, known, TrackerOptions(), references=scene.references)
+    instants = [scene.references, scene.later]
+    return [
+        rig.track([Frame(k, time, image) for image in images])
+        for k, (images, time) in enumerate(zip(instants, times, strict=True))
+    ]
+
+
+def test_a_rig_is_drawn_where_the_rows_of_the_first_camera_show_the_object(scene):
+    """Its centre goes on evenly, from the middle row's instant to that of the row that shows it."""
+    before, found = rolling(scene, (0.0, 1.0 / 30.0))
+    assert before.shown_state is before.estimate.state
+    centre = MODEL.nodes.mean(axis=0)[None]
+    earlier, now, shown = (
+        state.camera_from_object.apply(centre)
+        for state in (before.estimate.state, found.estimate.state, found.shown_state)
+    )
+    row = CAMERA.project(now)[0, 1]
+    seconds = 0.03 * (row - 0.5 * (CAMERA.height - 1)) / CAMERA.height
+    assert np.linalg.norm(shown - now) > 1e-5
+    np.testing.assert_allclose(shown - now, 30.0 * seconds * (now - earlier), rtol=0.1, atol=2e-6)
+
+
+def test_a_rig_says_that_its_readout_time_does_not_count(scene):
+    """The frame before is a second ago, which tells nothing of the motion while rows are read."""
+    _, found = rolling(scene, (0.0, 1.0))
+    assert found.warning(ReadoutNotUsed) == ReadoutNotUsed(1.0)
+    assert found.shown_state is found.estimate.state

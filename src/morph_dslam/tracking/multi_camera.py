@@ -36,6 +36,7 @@ from morph_dslam.tracking.outcomes import (
     ObjectMoved,
     PastForgotten,
     PoseSource,
+    ReadoutNotUsed,
     Rejection,
     RejectionReason,
     Status,
@@ -210,7 +211,7 @@ class RigTracker:
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
-        told = (*self.estimator.known.warnings, *_ignored(results, measured))
+        told = (*self.estimator.known.warnings, *_ignored(results, measured), *_readout_unused(results))
         is_hidden = estimate is None and known is not None and not has_moved
         result = FrameResult(
             self.model,
@@ -222,6 +223,7 @@ class RigTracker:
             n_points=sum(result.n_points for result in results),
             timings_ms=times,
             total_ms=sum(result.total_ms for result in results) + clock.total + where.milliseconds,
+            motion=results[0].motion,
             modulus_std=self.options.modulus_std,
         )
         if estimate is None:
@@ -401,6 +403,12 @@ def _blurred(results: list[FrameResult]) -> list[BlurredByMotion]:
     """The warning of motion blur of the camera that sees most of it, if one does."""
     found = [warning for result in results if (warning := result.warning(BlurredByMotion)) is not None]
     return sorted(found, key=lambda warning: -warning.path_px)[:1]
+
+
+def _readout_unused(results: list[FrameResult]) -> list[ReadoutNotUsed]:
+    """The warning that a readout time does not count, of the first camera that has it."""
+    found = [warning for result in results if (warning := result.warning(ReadoutNotUsed)) is not None]
+    return found[:1]
 
 
 def _few_agree(results: list[FrameResult], measured: RigObservations) -> list[FewPointsAgree]:
