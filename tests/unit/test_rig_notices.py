@@ -149,3 +149,23 @@ def test_a_rig_says_that_its_readout_time_does_not_count(scene):
     _, found = rolling(scene, (0.0, 1.0))
     assert found.warning(ReadoutNotUsed) == ReadoutNotUsed(1.0)
     assert found.shown_state is found.estimate.state
+
+
+def test_a_parameter_walks_on_over_instants_that_no_camera_has(scene):
+    """As in a scalar Kalman filter: nothing came of eleven instants, as where live frames are dropped."""
+    film, twist, step = SheetFilm(MODEL), 2, 5e-5
+    seen = [[film.frame(part.seen(sheet_state(0.3)), noise=12.0) for part in RIG] for _ in range(5)]
+
+    def deviations(n_missing, walks):
+        """Of the twist before and after these instants."""
+        known, options = Registration(MODEL, sheet_state(0.3)), TrackerOptions(random_walk=walks)
+        rig = RigTracker(MODEL, RIG, known, options, references=scene.references)
+        numbers = [0, 1, 2, 3, 4 + n_missing]
+        found = [rig.track([Frame(k, k / 30.0, i) for i in images]) for k, images in zip(numbers, seen, strict=True)]
+        return [result.estimate.parameter_std[twist] for result in found[-2:]]
+
+    own = deviations(0, ())[1]
+    for n_missing in (0, 11):
+        before, after = deviations(n_missing, (("twist", step),))
+        predicted = before**2 + (n_missing + 1) * step**2
+        assert after == pytest.approx(np.sqrt(1.0 / (1.0 / own**2 + 1.0 / predicted)), rel=0.05)

@@ -10,6 +10,7 @@ import scipy.sparse
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.registration.registration import PosePrior, Registration
+from morph_dslam.sources import Frame
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, Prior, State, moved
 from morph_dslam.tracking.noise import block_diagonal, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
@@ -169,25 +170,29 @@ def test_walking_parameter_is_smoothed_as_much_as_its_step_says():
     assert np.median(stated) == pytest.approx(own, rel=0.2)
 
 
-def test_a_parameter_walks_on_while_the_object_is_lost():
+def test_a_parameter_walks_on_while_the_object_is_lost_and_frames_are_dropped():
     """As in a scalar Kalman filter, by the deviation of a frame alone and that before the loss."""
     film, state, step = SheetFilm(MODEL), truth(0), 1e-4
     first, blank = film.frame(state), film.blank()
     seen = [film.frame(state, noise=12.0) for _ in range(8)]
 
-    def deviations(n_blank=0, n_without=0, steps=()):
-        """Of the twist before and after so many frames without the object, and so many instants without a frame."""
+    def deviations(n_blank=0, n_without=0, n_dropped=0, steps=()):
+        """Of the twist before and after so many frames without the object, and frames that are known to lack or not."""
         options = TrackerOptions(random_walk=steps)
         tracker = Tracker(MODEL, CAMERA, Registration(MODEL, state), options, reference=first)
-        before = [tracker.track(frame) for frame in seen[:-1]][-1]
-        assert all(tracker.track(blank).status == "lost" for _ in range(n_blank))
+        before = [tracker.track(Frame(k, k / 30.0, frame)) for k, frame in enumerate(seen[:-1])][-1]
+        number = len(seen) - 1
+        for k in range(n_blank):
+            assert tracker.track(Frame(number + k, (number + k) / 30.0, blank)).status == "lost"
         assert all(tracker.pass_over(None).status == "lost" for _ in range(n_without))
-        return [result.estimate.parameter_std[TWIST] for result in (before, tracker.track(seen[-1]))]
+        number += n_blank + n_without + n_dropped
+        after = tracker.track(Frame(number, number / 30.0, seen[-1]))
+        return [result.estimate.parameter_std[TWIST] for result in (before, after)]
 
     own = deviations(n_without=1)[1]
-    for n_blank, n_without in ((3, 0), (0, 20)):
-        before, after = deviations(n_blank, n_without, (("twist", step),))
-        predicted = before**2 + (n_blank + n_without + 1) * step**2
+    for n_blank, n_without, n_dropped in ((3, 0, 0), (0, 20, 0), (0, 0, 12), (0, 10, 10)):
+        before, after = deviations(n_blank, n_without, n_dropped, (("twist", step),))
+        predicted = before**2 + (n_blank + n_without + n_dropped + 1) * step**2
         assert after == pytest.approx(np.sqrt(1.0 / (1.0 / own**2 + 1.0 / predicted)), rel=0.03)
 
 

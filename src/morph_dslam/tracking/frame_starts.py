@@ -156,10 +156,11 @@ def at_constant_velocity(before: State, last: State) -> State:
 
 
 class FrameGaps:
-    """Watches the times of frames."""
+    """Watches the times and numbers of frames."""
 
     def __init__(self) -> None:
         self._last: float | None = None
+        self._number: int | None = None
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
 
     def after_gap(self, timestamp: float) -> bool:
@@ -176,6 +177,22 @@ class FrameGaps:
         is_gap = bool(self._intervals) and interval > max(GAP_S, GAP_INTERVALS * float(np.median(self._intervals)))
         self._intervals.append(interval)
         return is_gap
+
+    def n_missing(self, number: int | None) -> int:
+        """How many frames there were between the last one and the next one, of this number: lost, or dropped live.
+
+        One without a number comes right after the last one.
+        """
+        if number is None:
+            self.pass_over()
+            return 0
+        before, self._number = self._number, number
+        return 0 if before is None else max(int(number) - before - 1, 0)
+
+    def pass_over(self) -> None:
+        """Count a frame that did not come, but is known of."""
+        if self._number is not None:
+            self._number += 1
 
 
 def temporal_facts(parameters: Sequence[Parameter], options: TrackerOptions) -> dict[str, str]:

@@ -20,7 +20,7 @@ from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX,
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_results import warnings_of_place, with_flat_sides, with_model_errors
-from morph_dslam.tracking.frame_starts import new_filter, next_start
+from morph_dslam.tracking.frame_starts import FrameGaps, new_filter, next_start
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import NO_DISCREPANCY, NO_LOADS, TrackerOptions
@@ -149,7 +149,7 @@ class RigTracker:
                 raise RegistrationError(f"camera {number}: {NO_TEXTURE}" if self.options.use_texture else OUTLINE_ALONE)
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
-        self._filter = new_filter(self.estimator, self.options)
+        self._filter, self._gaps = new_filter(self.estimator, self.options), FrameGaps()
         depth_stds = [self.options.depth_scale_std] * len(self.cameras)
         if registration.depth_scale is not None:  # found with the pose, whose covariance holds its error
             depth_stds[0] = 0.0
@@ -199,6 +199,7 @@ class RigTracker:
         where = localization or CameraLocalization()
         number, time = _number_and_time(frames)
         self.estimator.known.begin(number, time)
+        self._filter.go_on(self._gaps.n_missing(number))
         known, results = where.pose_prior, self._each(frames, time, where.pose_prior, occluder_depths)
         has_moved = any(result.warning(ObjectMoved) is not None for result in results)
         prior = None if known is None or has_moved else self._prior(known, results)

@@ -62,7 +62,7 @@ class TrackerOptions(CheckedOptions):
     use_unknown_loads : whether loads that the study does not foresee are estimated too (`estimation.loads`).
     per_sequence : names of the parameters that are one over the whole sequence.
     random_walk : names of parameters that hardly change from frame to frame, each with the standard deviation
-        of the change, SI: a prior on them. None by default.
+        of the change from one frame number to the next, SI: a prior on them. None by default.
     start : where the search for a frame's state starts: from the previous state, or from where the last two
         lead at constant velocity.
     new_views, max_views : whether frames in which the reference view shows too little of what is seen may

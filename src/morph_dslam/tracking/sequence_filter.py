@@ -274,11 +274,11 @@ class SequenceFilter(Generic[Frame]):
         if self._past is not None:
             self._past = self._past.with_points(change, self._kept)
 
-    def go_on(self) -> None:
-        """Take a step of what walks, for a frame that tells nothing; `fuse` does so for its own."""
-        past = self._past
-        if past is not None:
-            covariance, by_frames = past.covariance + self._step, past.by_frames + self._step
+    def go_on(self, count: int = 1) -> None:
+        """Take a step of what walks, for each of ``count`` frames that tell nothing; `fuse` does so for its own."""
+        past, steps = self._past, count * self._step
+        if past is not None and count:
+            covariance, by_frames = past.covariance + steps, past.by_frames + steps
             self._past = replace(past, covariance=covariance, by_frames=by_frames)
 
     def fuse(self, measured: Frame, alone: Estimate, known: Prior | None = None) -> Estimate:

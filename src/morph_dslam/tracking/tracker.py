@@ -188,6 +188,7 @@ class Tracker:
         camera = localization or self.locate(frame)
         numbered = (frame.index, frame.timestamp) if isinstance(frame, Frame) else (None, None)
         self.estimator.known.begin(*numbered)
+        self._filter.go_on(self._gaps.n_missing(numbered[0]))
         with frame_clock(STAGES) as clock:
             image = self._prepare(frame, occluder_depth, camera.image)
             prior = self._predict(camera)
@@ -505,6 +506,7 @@ class Tracker:
         self._history.motion(timestamp)
         self._history.add(None)
         self._filter.go_on()
+        self._gaps.pass_over()
         if timestamp is not None:
             self._gaps.after_gap(timestamp)
         if self._views is not None:  # before the first frame nothing is followed that could be lost
