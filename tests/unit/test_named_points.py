@@ -168,6 +168,25 @@ def test_a_discrepancy_widens_deviations_by_the_process():
     )
 
 
+def test_the_largest_displacement_contains_the_discrepancy():
+    """A bump on the flat sheet is highest at its centre, where it is what it is known to be there.
+
+    The deviation is that of the bump's components, (0.3, 0.2, 0.6) mm, in its direction.
+    """
+    middle = np.argmin(np.linalg.norm(MODEL.nodes, axis=1))
+    bump, known = np.array([3e-3, 0.0, 4e-3]), np.diag([0.3e-3, 0.2e-3, 0.6e-3]) ** 2
+    basis = DiscrepancyBasis(MODEL.nodes[[middle]], 0.05)
+    found = Discrepancy(basis, bump[None], DiscrepancyDeviation(known, 1e-3, basis))
+    result = replace(in_frame(MODEL, [0.0, 0.0, 0.0], np.zeros((3, 3))), discrepancy=found)
+    run = run_of(MODEL, [], result, lost_frame(MODEL), replace(result, discrepancy=None))
+    largest = run.largest_displacements()
+    assert largest[0] == pytest.approx([5e-3, np.hypot(0.6 * 0.3e-3, 0.8 * 0.6e-3)], rel=1e-3)
+    assert np.isnan(largest[1]).all()
+    assert largest[2] == pytest.approx([0.0, 0.0], abs=1e-9)
+    run.add(3, 0.3, result)
+    assert run.last_largest()[0] == pytest.approx(5e-3)
+
+
 def test_unknown_parameters_leave_a_displacement_open():
     result = in_frame(MODEL, STATE, np.full((3, 3), np.inf))
     (found,) = run_of(MODEL, [CORNER], result).point_displacements()["corner"]

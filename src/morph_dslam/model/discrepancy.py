@@ -25,6 +25,8 @@ from morph_dslam.model.field_storage import read_array
 Array = NDArray[np.float64]
 #: For so many arrays of positions a basis keeps its influence: points, drawn nodes and inner structures.
 KEPT = 8
+#: On so many positions the influence is found as fast as kept: they push out no others.
+FEW = 16
 #: Added to the covariance's diagonal, relative: points that lie close together make it nearly singular.
 JITTER = 1e-6
 
@@ -58,6 +60,8 @@ class DiscrepancyBasis:
 
         It is kept for the arrays that were asked for last, which must stay as they are.
         """
+        if len(positions) <= FEW:
+            return self.influence_on(positions)
         known = self._known.get(id(positions))
         if known is not None and known[0] is positions:
             return known[1]

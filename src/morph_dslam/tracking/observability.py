@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.geometry import cross_matrix
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.reduced_model import von_mises
 from morph_dslam.model.separated import SeparatedField
 from morph_dslam.tracking.estimator import BOUND_SHARE, Estimate
@@ -251,15 +252,29 @@ def von_mises_std(model: ReducedModel, estimate: Estimate, place: str) -> Array:
     return np.sqrt(_variances(along[:, :, None], estimate.covariance)[:, 0])
 
 
-def largest_displacement(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:
-    """The largest length of a node's displacement, metres, and its standard deviation."""
+def largest_displacement(
+    model: ReducedModel, estimate: Estimate, discrepancy: Discrepancy | None = None
+) -> tuple[float, float]:
+    """The largest length of a node's displacement, metres, and its standard deviation.
+
+    Parameters
+    ----------
+    model : of the object.
+    estimate : of its state.
+    discrepancy : what the displacement has beyond the model's; None where it was not estimated.
+    """
     value = model.displacement.value(estimate.state.parameters)
+    if discrepancy is not None:
+        value = value + discrepancy.displacement(model.nodes)
     length = np.linalg.norm(value, axis=1)
     node = int(length.argmax())
     direction = value[node] / max(float(length[node]), 1e-300)
     deviation = _deviation(model.displacement, node, direction, estimate.state, estimate.image_covariance)
     # In one direction of three.
-    return float(length[node]), float(np.hypot(deviation, estimate.model_displacement_in_object / np.sqrt(3.0)))
+    variance = deviation**2 + estimate.model_displacement_in_object**2 / 3.0
+    if discrepancy is not None:
+        variance += float(direction @ discrepancy.covariances(model.nodes[[node]])[0] @ direction)
+    return float(length[node]), float(np.sqrt(variance))
 
 
 def largest_von_mises(model: ReducedModel, estimate: Estimate) -> tuple[float, float]:

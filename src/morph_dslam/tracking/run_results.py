@@ -72,6 +72,7 @@ class RunResults:
         self.results.append(result)
         if result.discrepancy is not None and result.discrepancy.deviation is not None:
             self._known_points()
+            self._known_displacements()
             self.results[-1] = replace(result, discrepancy=replace(result.discrepancy, deviation=None))
 
     def __len__(self) -> int:
@@ -200,13 +201,17 @@ class RunResults:
     # What is known of the frames so far is kept, so that a frame costs the same however long the run is.
 
     def _known_displacements(self) -> list[tuple[float, float]]:
-        return self._added_to(self._largest, lambda found: largest_displacement(self._surface, found), _UNKNOWN)
+        return self._added_to(
+            self._largest, lambda found, beyond: largest_displacement(self._surface, found, beyond), _UNKNOWN
+        )
 
     def _known_stresses(self) -> list[tuple[float, float]]:
-        return self._added_to(self._stressed, lambda found: largest_von_mises(self._stressed_surface, found), _UNKNOWN)
+        return self._added_to(
+            self._stressed, lambda found, _: largest_von_mises(self._stressed_surface, found), _UNKNOWN
+        )
 
     def _known_reactions(self) -> list[dict[str, Reaction]]:
-        return self._added_to(self._reactions, lambda found: self._reactions_of_model(found, self.modulus_std), {})
+        return self._added_to(self._reactions, lambda found, _: self._reactions_of_model(found, self.modulus_std), {})
 
     def _known_points(self) -> list[tuple[list[VectorEstimate], list[VectorEstimate]] | None]:
         """Displacements and turns of the named points."""
@@ -234,10 +239,12 @@ class RunResults:
         stresses = {place: f.with_modes(f.modes[:, used]) for place, f in self.model.stresses.items()}
         return replace(self.model, stresses=stresses)
 
-    def _added_to(self, known: list[_Known], of: Callable[[Estimate], _Known], lost: _Known) -> list[_Known]:
+    def _added_to(
+        self, known: list[_Known], of: Callable[[Estimate, Discrepancy | None], _Known], lost: _Known
+    ) -> list[_Known]:
         """What is ``known`` of the frames so far (f), added to by that ``of`` those since, ``lost`` without one."""
-        estimates = (result.estimate for result in self.results[len(known) :])
-        known += [lost if found is None else of(found) for found in estimates]
+        for result in self.results[len(known) :]:
+            known.append(lost if result.estimate is None else of(result.estimate, result.discrepancy))
         return known
 
     def timings_ms(self) -> Array:
