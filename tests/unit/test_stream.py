@@ -60,7 +60,7 @@ def publisher():
 
 @pytest.fixture
 def sink(publisher, model):
-    return StreamSink([publisher]).begin({"block": StreamedObject(model, modulus_std=0.1)}, CAMERA)
+    return StreamSink([publisher]).begin({"block": model}, CAMERA)
 
 
 def wait_until(condition):
@@ -119,7 +119,8 @@ def test_structures_inside_move_with_the_object(publisher, model):
 def test_a_frame_has_the_values_of_the_closed_form(publisher, sink, model):
     received = taking(publisher)
     for number, (stretch, slide) in enumerate(STATES):
-        sink(tracked_frame(10 + number, 0.1 * number, block=tracked_result(model, stretch, slide)))
+        result = replace(tracked_result(model, stretch, slide), modulus_std=0.1)
+        sink(tracked_frame(10 + number, 0.1 * number, block=result))
         message = next(received)
         assert (message["type"], message["number"], message["frame"]) == ("frame", number, 10 + number)
         assert message["timestamp"] == pytest.approx(0.1 * number)

@@ -46,7 +46,6 @@ class StreamedObject:
     model : of the object.
     name : that streams call it by; that of its tracker if empty.
     show : what colours it; None for the stress of a model that has it, else the displacement.
-    modulus_std : standard deviation of a factor common to all moduli: it counts in the reactions.
     field : what colours the surface, where it is drawn as well; None to make one.
     inner : structures inside that are sent too.
     """
@@ -54,7 +53,6 @@ class StreamedObject:
     model: ReducedModel
     name: str = ""
     show: Shown | None = None
-    modulus_std: float = 0.0
     field: ShownField | None = None
     inner: Sequence[CarriedStructure] = ()
 
@@ -154,7 +152,7 @@ class _ObjectMessages:
         model = streamed.model
         points, triangles = surface_points(model)
         kind = shown_field(model, streamed.show)
-        self._rest, self._modulus_std = model.rest_positions(points), streamed.modulus_std
+        self._rest = model.rest_positions(points)
         self._field, self._reactions = streamed.field or ShownField(model, points, kind), Reactions(model)
         self._inner = tuple(streamed.inner)
         self._covers_jumps, self._si_factor = kind == "displacement", self._field.kind.si_factor
@@ -176,7 +174,7 @@ class _ObjectMessages:
         vertices, scalar = (None, None) if found is None else self._surface(result, found)
         reactions, inside = {}, dict[str, NDArray[np.float32]]()
         if found is not None:
-            reactions, mu = self._reactions(found, self._modulus_std), found.state.parameters
+            reactions, mu = self._reactions(found, result.modulus_std), found.state.parameters
             inside = {one.name: one.nodes(mu, result.discrepancy).astype(np.float32) for one in self._inner}
         return ObjectMessage(
             self.info.name,

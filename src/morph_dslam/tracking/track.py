@@ -419,9 +419,7 @@ class _Job:
         if self._streams is None:
             return []
         objects = {
-            part.name: StreamedObject(
-                part.model, name, _shown_of(part, self._run), part.options.modulus_std, view.surface_field, part.inner
-            )
+            part.name: StreamedObject(part.model, name, _shown_of(part, self._run), view.surface_field, part.inner)
             for part, name, view in zip(placed, self._run.stream_names, self._views, strict=True)
         }
         return [self._streams.begin(objects, placed[0].camera)]
