@@ -215,21 +215,21 @@ def test_nothing_of_a_run_that_is_overwritten_stands_in_the_report_of_the_next(t
     assert left >= {"own.png", "notes.txt", "plots/own.txt", "result.h5", "model.morph"}  # the reader's own, the run
 
 
-@pytest.mark.parametrize("is_live", [False, True])
-def test_pictures_of_a_live_run_have_their_time_and_no_numbers_of_frames(is_live, tmp_path):
-    """Its video stands still where frames were dropped: the picture at one place was called as the frame at another."""
+def test_pictures_of_a_video_have_their_time_and_no_numbers_of_frames(tmp_path):
+    """A live run's video stands still where frames were dropped, and a rig's lacks what the first camera lacks.
+
+    The picture at one place was called as the frame at another.
+    """
     write_run(tmp_path)
-    (tmp_path / "summary.json").write_text('{"live": {}}' if is_live else "{}")
     with VideoWriter(tmp_path / "augmented.mp4", 20.0, (64, 48)) as video:
         for level in range(41):
             video.write(np.full((48, 64, 3), 5 * level, dtype=np.uint8))
     page = write_run_report(tmp_path, load_run(tmp_path)).read_text()
     captions = re.findall(r"<figcaption>(At [^<]*|Frame [^<]*)</figcaption>", page)
     n = len(captions)
-    # Spread evenly over two seconds.
-    seconds = [f"At {2.0 * (k + 1) / (n + 1):.1f} s" for k in range(n)]
     assert n > 1
-    assert captions == seconds if is_live else all(caption.startswith("Frame ") for caption in captions)
+    # Spread evenly over two seconds.
+    assert captions == [f"At {2.0 * (k + 1) / (n + 1):.1f} s" for k in range(n)]
 
 
 def test_a_run_folder_has_one_writer(tmp_path):

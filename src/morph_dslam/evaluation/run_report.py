@@ -199,8 +199,8 @@ N_FRAMES_SHOWN = 4
 _SHOWN_ABOVE = ("model", "n_frames", "n_tracked", "median_ms", "p95_ms")
 
 
-def sample_video(path: Path, count: int) -> list[tuple[int, float, bytes]]:
-    """Up to ``count`` frames spread over a video, as (0-based position, seconds, JPEG); none if it cannot be read."""
+def sample_video(path: Path, count: int) -> list[tuple[float, bytes]]:
+    """Up to ``count`` frames spread over a video, as (seconds, JPEG); none if it cannot be read."""
     capture = open_capture(str(path))
     total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     wanted = set(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1].tolist()) if total > 0 else set()
@@ -212,7 +212,7 @@ def sample_video(path: Path, count: int) -> list[tuple[int, float, bytes]]:
             break
         if position in wanted:
             jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
-            pictures.append((position, position / frame_rate(capture), jpeg))
+            pictures.append((position / frame_rate(capture), jpeg))
     capture.release()
     return pictures
 
@@ -297,15 +297,12 @@ def _evaluations(folder: Path) -> list[Section]:
     return [make(folder, _content(path)) for path, make in files if path.is_file()]
 
 
-def _video_section(folder: Path, run: Run) -> Section:
+def _video_section(folder: Path) -> Section:
     if not (folder / VIDEO).is_file():
         return Section("Augmented video", [])
-    # That of a live run stands still where frames were dropped: its pictures are not the run's frames one by one.
-    is_live = "live" in _content(folder / "summary.json")
-    frames = [
-        Picture(data, ".jpg", f"At {s:.1f} s" if is_live else f"Frame {run.frames[min(position, len(run.frames) - 1)]}")
-        for position, s, data in sample_video(folder / VIDEO, N_FRAMES_SHOWN)
-    ]
+    # The number of the frame is in the picture. Its place in the video does not give it: a live run's video stands
+    # still where frames were dropped, a rig's leaves out what the first camera lacks.
+    frames = [Picture(data, ".jpg", f"At {s:.1f} s") for s, data in sample_video(folder / VIDEO, N_FRAMES_SHOWN)]
     return Section("Augmented video", [Link(VIDEO, f"The whole video ({VIDEO})"), *frames])
 
 
@@ -345,7 +342,7 @@ def write_run_report(folder: Path, run: Run) -> Path:
     tracking, settings = _tracking_sections(folder)
     sections = [
         *_evaluations(folder),
-        _video_section(folder, run),
+        _video_section(folder),
         _lost_section(run),
         tracking,
         *(Section(f"Model: {name}", [table]) for name, table in summarise_model(run.model.without_loads).items()),
