@@ -307,6 +307,12 @@ def times_of_series(folder):
         ("slide_mm,time [s]\n1,1e9\n\n2,1000000000.25\n", {"from_line": ["2", "4"]}, [1e9, 1e9 + 0.25]),
         ("slide_mm,stamp_s\n1,0.5\n2,0.75\n", {"from_line": ["2", "3"]}, [0, 1]),
         ("frame,timestamp_s,slide_mm\n7,0.5,1\n8,0.75,2\n", {"from_frame": ["7", "8"]}, [0.5, 0.75]),
+        # The time of a run's frames, not a parameter of that name, which is estimated.
+        (
+            "frame,timestamp_s,pose_from,slide_mm,time_s\n7,0.5,,1,2\n8,0.75,,2,9\n",
+            {"from_frame": ["7", "8"]},
+            [0.5, 0.75],
+        ),
         ("slide_mm,time_s\n1,0.5\n2,0.5\n", {"from_line": ["2", "3"]}, [0, 1]),  # of a grid
         ("slide_mm,time_s\n1,0.5\n2,\n", {"from_line": ["2", "3"]}, [0, 1]),
     ],

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 MOST_STATES = 10_000
 #: States of a tour from the default to one end of a range; twice as many cross it.
 _QUARTER = 6
-#: Columns of a table that hold the seconds of its states, the first of them that there is; the second as in frames.csv.
+#: Columns of a table that hold the seconds of its states, the first of them that there is; frames.csv has the second.
 TIMES = (("time", "s"), ("timestamp", "s"))
 
 
@@ -309,7 +309,9 @@ def _origins(header: Sequence[str], rows: Sequence[tuple[int, list[str]]]) -> li
 def _times(header: Sequence[str], rows: Sequence[list[str]]) -> Array | None:
     """Seconds (s,) of the table's rows; None if it has none, or they do not grow, as in a grid."""
     named = [name_and_unit(title) for title in header]
-    column = next((named.index(title) for title in TIMES if title in named), None)
+    # In a run's table "time" is a parameter, an estimate.
+    titles = TIMES[1:] if "pose_from" in header else TIMES
+    column = next((named.index(title) for title in titles if title in named), None)
     if column is None:
         return None
     try:
