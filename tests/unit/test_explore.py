@@ -209,3 +209,10 @@ def test_a_page_that_is_closed_at_once_is_no_error(serve, capfd):
 @pytest.mark.parametrize("target", ["//[", "http://[", "[?mu=1"])
 def test_what_is_no_url_is_not_there(target):
     assert ModelPages(stretched_block_model()).answer(target) is None
+
+
+@pytest.mark.parametrize("target", ["http://127.0.0.1:8080/model.json", "HTTP://localhost/model.json?now=1"])
+def test_a_target_in_absolute_form_is_answered(target):
+    pages = ModelPages(stretched_block_model())
+    assert pages.answer(target) == pages.answer("/model.json")
+    assert pages.answer("http://localhost") == pages.answer("/")

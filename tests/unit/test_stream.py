@@ -322,6 +322,17 @@ def test_strangers_are_refused(publisher, token, headers, status):
     assert not publisher.is_watched
 
 
+@pytest.mark.parametrize("target", ["//[", "http://[", "/[?token={token}"])
+def test_what_is_no_url_is_not_there(publisher, target):
+    asked = target.format(token=publisher.token)
+    assert ask(publisher, asked, Host=f"127.0.0.1:{publisher.port}")[0] == (404 if "token" in target else 401)
+
+
+def test_a_target_in_absolute_form_is_answered(publisher):
+    """RFC 9112, 3.2.2: servers must accept it."""
+    assert ask(publisher, publisher.place)[0] == 303
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="has one address of this computer only")
 def test_the_address_is_the_one_that_was_asked_for():
     # This computer's name may stand for another address, at which nobody listens.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import ExploreError
+from morph_dslam.io.access import split_target
 from morph_dslam.io.local_server import LocalHandler, LocalServer, local_server
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.reduced_model import von_mises
@@ -161,7 +162,7 @@ class ModelPages:
         BadRequest
             If the query describes no state of the model.
         """
-        path, _, asked = target.partition("?")  # what is no URL is a page that is not there
+        path, asked = split_target(target)
         if path in _FILES:
             name = _FILES[path]
             content = files("morph_dslam.explorer").joinpath("static", *name.split("/")).read_bytes()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 #: The address of this computer that no other one reaches.
 HOST = "127.0.0.1"
+_ORIGIN = re.compile(r"https?://(\[[^/?\[\]]+\]|[^/?\[\]]+)(:\d*)?(?=[/?]|$)", re.IGNORECASE)
 
 
 def new_token() -> str:
@@ -20,6 +22,16 @@ def new_token() -> str:
 def same_token(given: str, token: str) -> bool:
     """Whether a token is the right one, in a time that tells nothing of it."""
     return hmac.compare_digest(given.encode(errors="replace"), token.encode())
+
+
+def split_target(target: str) -> tuple[str, str]:
+    """Path and query of a request's target, "/page?query", also in absolute form, with "http://name" before it.
+
+    Servers must take both (RFC 9112, 3.2.2). A target that is no URL is a path that nothing has.
+    """
+    absolute = _ORIGIN.match(target)
+    path, _, query = target[absolute.end() if absolute else 0 :].partition("?")
+    return path or "/", query
 
 
 class ServerNames:

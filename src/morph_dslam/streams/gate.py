@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from morph_dslam.errors import StreamError
-from morph_dslam.io.access import HOST, ServerNames, new_token, same_token
+from morph_dslam.io.access import HOST, ServerNames, new_token, same_token, split_target
 
 #: An environment variable that keeps the token from run to run.
 TOKEN_VARIABLE = "MORPH_STREAM_TOKEN"
@@ -79,7 +79,7 @@ class StreamGate:
 
     def has_token(self, path: str) -> bool:
         """Whether an address carries the token."""
-        return same_token(parse_qs(urlsplit(path).query).get("token", [""])[-1], self._token)
+        return same_token(parse_qs(split_target(path)[1]).get("token", [""])[-1], self._token)
 
     def _cookie_of(self, headers: Mapping[str, str]) -> str:
         try:

@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
-from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -26,7 +25,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from morph_dslam.errors import StreamError
-from morph_dslam.io.access import HOST
+from morph_dslam.io.access import HOST, split_target
 from morph_dslam.streams.colours import colour_map
 from morph_dslam.streams.gate import StreamGate, stream_token
 from morph_dslam.streams.messages import FrameMessage, SceneMessage
@@ -229,7 +228,7 @@ class WebSocketPublisher:
 
     def _answer(self, client: ServerConnection, request: Request) -> Response | None:
         """Refuse a request, or answer it with a file of the page; None to go on with a WebSocket."""
-        path = urlsplit(request.path).path
+        path, _ = split_target(request.path)
         try:
             refusal = self._gate.refusal(request.path, request.headers)
         except LookupError:  # a header that may stand once stands twice

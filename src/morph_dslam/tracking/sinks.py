@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import TrackingError
+from morph_dslam.io.access import split_target
 from morph_dslam.io.local_server import LocalHandler, local_server
 from morph_dslam.io.video import VideoWriter
 from morph_dslam.sources import Frame
@@ -209,10 +210,11 @@ class _Handler(LocalHandler):
         super().__init__(*arguments)
 
     def answer(self) -> None:
-        if self.path == "/":
+        path, _ = split_target(self.path)
+        if path == "/":
             self.begin("text/html; charset=utf-8")
             self.wfile.write(_PAGE)
-        elif self.path == "/stream.mjpg":
+        elif path == "/stream.mjpg":
             self._stream()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
