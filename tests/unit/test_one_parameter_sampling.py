@@ -137,6 +137,24 @@ def test_middles_are_predicted_by_the_functions_of_the_model(tmp_path: Path, bas
     assert rounds[-1]["largest_estimate"] == pytest.approx(0.0 if basis is None else 1.0 / 16.0**2 / 4.0, abs=1e-6)
 
 
+def test_few_samples_that_a_spline_would_go_through_predict_a_parabola(tmp_path: Path) -> None:
+    """Of the first five the ends and the middle are solved: a parabola through them meets the middles between."""
+    chosen = study()
+    chosen = chosen.model_copy(update={"reduction": chosen.reduction.model_copy(update={"basis": "cubic_spline"})})
+    everywhere = sweep_of(lambda t: (t**2, 2.0 * t), chosen, tmp_path)
+
+    def sweep(samples: Array) -> SweepResult:
+        result = everywhere(samples)
+        for index in np.flatnonzero(np.isin(samples[:, 0], (0.25 * 6e5, 0.75 * 6e5))).tolist():
+            result.failed[index] = "no equilibrium"
+            del result.solved[index]
+        return result
+
+    samples, rounds = sample_by_bisection(chosen, sweep)
+    assert [entry["largest_estimate"] for entry in rounds] == pytest.approx([0.0], abs=1e-6)
+    assert len(samples) == 9
+
+
 def test_sampling_ends_at_the_most_samples_and_leaves_what_cannot_be_solved(tmp_path: Path) -> None:
     chosen = study(training=11)
     samples, _ = sample_by_bisection(

@@ -2,7 +2,8 @@
 
 Where slopes are known, piecewise cubics take values and slopes of every sample (Hermite): between two samples they
 depend on these two alone, so that what is sharp in one place stays there. Their error is at most h^4 / 384 times the
-fourth derivative. Where slopes are unknown, a cubic spline goes through the values.
+fourth derivative. Where slopes are unknown, a cubic spline goes through the values, or a line or a parabola where these
+are fewer than four.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.model.basis_functions import cubic_spline_basis, hat_basis, hermite_basis
+from morph_dslam.model.basis_functions import chebyshev_basis, cubic_spline_basis, hat_basis, hermite_basis
 from morph_dslam.model.tensor_functions import TensorTrainFunctions
 from morph_dslam.studies.sections import BasisName
 
@@ -52,7 +53,8 @@ def interpolate_line(
         matrix = np.concatenate([table[:, 0], size * table[:, 1]])
         coefficients = np.linalg.solve(matrix, np.concatenate([values[order], size * slopes[order]]))
     else:
-        basis = hat_basis(nodes) if name == "hat" else cubic_spline_basis(nodes)
+        few = chebyshev_basis(nodes[0], nodes[-1], len(nodes) - 1) if len(nodes) < LEAST else None
+        basis = hat_basis(nodes) if name == "hat" else few or cubic_spline_basis(nodes)
         coefficients = np.linalg.solve(basis.evaluate(nodes), values[order])
     core = np.ascontiguousarray(coefficients.T[:, :, None], dtype=np.float64)
     return TensorTrainFunctions((basis,), (core,))
