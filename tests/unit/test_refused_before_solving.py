@@ -276,14 +276,18 @@ def toml(value: Any) -> str:
 
 @pytest.mark.parametrize("slopes", [False, True])
 @pytest.mark.parametrize("d", [2, 3])
-def test_as_many_samples_are_asked_for_as_a_regression_needs(d, slopes):
+@pytest.mark.parametrize("degree", [1, 2, 8])
+def test_as_many_samples_are_asked_for_as_a_regression_needs(degree, d, slopes):
     """The fewest that a study may have are the fewest that polynomials can be fitted to."""
     names = [f"q{k}" for k in range(d - 1)]
     loads = [{"kind": "traction", "on": "z_max", "traction": [f"1 kPa * {name}", "0 Pa", "0 Pa"]} for name in names]
     more = {name: {"range": [0.0, 1.0]} for name in names}
     base = SOLID if slopes else SOLID | clock("0 s", "10 s")
     base = base | {"parameters": base["parameters"] | dict(list(more.items())[: d - len(base["parameters"])])}
-    base = base | {"loads": [*base["loads"], *loads[: d - 1 - (not slopes)]], "reduction": {"method": "pod"}}
+    base = base | {
+        "loads": [*base["loads"], *loads[: d - 1 - (not slopes)]],
+        "reduction": {"method": "pod", "max_degree": degree},
+    }
 
     def allowed(count: int) -> bool:
         try:
@@ -296,7 +300,7 @@ def test_as_many_samples_are_asked_for_as_a_regression_needs(d, slopes):
         x = np.random.default_rng(0).random((count, d))
         gradients = np.ones((count, d, 1)) if slopes else None
         try:
-            fit_functions(x, x[:, :1], gradients, np.zeros(d), np.ones(d), 2, np.arange(count))
+            fit_functions(x, x[:, :1], gradients, np.zeros(d), np.ones(d), degree, np.arange(count))
         except StudyError:
             return False
         return True

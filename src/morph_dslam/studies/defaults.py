@@ -44,7 +44,8 @@ def resolve_defaults(study: Study) -> Study:
         in_time = isinstance(study, SolidStudy) and study.time is not None
         sampling = _sampling(study.sampling, method, dimension, _why_no_equations(study) is None, in_time)
         if isinstance(study, BodyStudy) and method.name == "pod" and sampling.scheme in ("sobol", "paths"):
-            _check_count(sampling.training, dimension - (sampling.scheme == "paths"), _has_slopes(study))
+            others = dimension - (sampling.scheme == "paths")
+            _check_count(sampling.training, others, _has_slopes(study), study.reduction.max_degree)
         update["sampling"] = sampling
     return study.model_copy(update=update)
 
@@ -59,9 +60,12 @@ def _has_slopes(study: BodyStudy) -> bool:
     return isinstance(study, ShellStudy) and all(support.kind == "foundation" for support in study.supports)
 
 
-def _check_count(training: int, dimension: int, slopes: bool) -> None:
-    """Refuse fewer samples than a polynomial of second degree is fitted to, which shows when all are solved only."""
-    rows, terms = 1 + dimension if slopes else 1, len(total_degree_indices(dimension, 2))
+def _check_count(training: int, dimension: int, slopes: bool, max_degree: int) -> None:
+    """Refuse fewer samples than a polynomial is fitted to, which shows when all are solved only.
+
+    It is of second degree, or of ``max_degree`` where that is 1.
+    """
+    rows, terms = 1 + dimension if slopes else 1, len(total_degree_indices(dimension, min(2, max_degree)))
     # What `regression.fit_functions` asks for with one of the parts left out.
     fewest = next(n for n in count(1) if terms <= 0.8 * rows * (n - -(-n // FOLDS)))
     if training < fewest:
