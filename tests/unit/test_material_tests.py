@@ -433,9 +433,17 @@ def test_errors_about_a_stretch_of_one_have_no_wrong_sign():
         assert Span.of([made("uniaxial", stretch, measured)]).shear == pytest.approx(0.4e6, rel=2e-3)
 
 
-@pytest.mark.parametrize(("least", "word"), [(0.9, "compression"), (1.0, "tension")])
-def test_a_part_of_a_test_with_the_wrong_sign_is_refused(least, word):
-    stretch = np.linspace(least, 1.5, 40)
+def test_a_stretch_that_is_counted_from_a_wrong_zero_is_no_wrong_sign():
+    """By a tenth of the range: where the stretch is below 1, stresses are above zero, and rise with it."""
+    true = np.linspace(1.0, 2.0, 101)
+    assert Span.of([made("uniaxial", true - 0.1, 0.4e6 * (true - true**-2))]).shear == pytest.approx(0.4e6, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "word"), [(0.9, 1.5, "compression"), (0.93, 2.0, "compression"), (1.0, 1.5, "tension")]
+)
+def test_a_part_of_a_test_with_the_wrong_sign_is_refused(least, most, word):
+    stretch = np.linspace(least, most, 40)
     stress = 0.4e6 * (stretch - stretch**-2)
     with pytest.raises(IdentificationError, match=f"stresses in {word} have the wrong sign"):
         Span.of([made("uniaxial", stretch, np.abs(stress) if word == "compression" else -stress)])
