@@ -24,21 +24,35 @@ def _distances_to_triangles(points: Array, corners: Array) -> Array:
     return np.where((sides > 0.0).all(axis=1), heights / lengths, to_edges)
 
 
-def distances_to_surface(points: Array, nodes: Array, triangles: NDArray[np.integer]) -> Array:
-    """Distance (p,) of each point (p, 3) to the nearest point of a surface, in the unit of the input.
+#: Points that are looked for together, lest their candidates fill the memory.
+_AT_ONCE = 1000
 
-    The nearest triangle is no farther than the nearest centre of one, so its own centre is within that and the
-    largest radius of a triangle.
+
+def nearest_triangles(points: Array, nodes: Array, triangles: NDArray[np.integer]) -> tuple[NDArray[np.int64], Array]:
+    """The triangle (p,) of a surface that is nearest to each point (p, 3), and the distance (p,) from it.
+
+    The nearest triangle is no farther than the one whose centre is nearest, so its own centre is within that distance
+    and the largest radius of a triangle.
     """
-    if not len(points):
-        return np.zeros(0)
     points = np.ascontiguousarray(points, dtype=np.float64)
     corners = np.asarray(nodes, dtype=np.float64)[triangles]
     centres = corners.mean(axis=1)
     tree = KDTree(centres)
-    reach = tree.query(points)[0] + np.linalg.norm(corners - centres[:, None], axis=2).max()
-    near = tree.query_ball_point(points, reach * (1.0 + 1e-9))
-    counts = np.array([len(found) for found in near])
-    candidates = np.concatenate(near).astype(np.int64)
-    distances = _distances_to_triangles(np.repeat(points, counts, axis=0), corners[candidates])
-    return np.minimum.reduceat(distances, np.cumsum(counts) - counts)
+    reach = _distances_to_triangles(points, corners[tree.query(points)[1]])
+    reach += np.linalg.norm(corners - centres[:, None], axis=2).max()
+    rows, found = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+    for first in range(0, len(points), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        near = tree.query_ball_point(points[part], reach[part] * (1.0 + 1e-9))
+        counts = np.array([len(each) for each in near])
+        candidates = np.concatenate(near).astype(np.int64)
+        distances = _distances_to_triangles(np.repeat(points[part], counts, axis=0), corners[candidates])
+        order = np.lexsort((distances, np.repeat(np.arange(len(counts)), counts)))
+        best = order[np.cumsum(counts) - counts]
+        rows[part], found[part] = candidates[best], distances[best]
+    return rows, found
+
+
+def distances_to_surface(points: Array, nodes: Array, triangles: NDArray[np.integer]) -> Array:
+    """Distance (p,) of each point (p, 3) to the nearest point of a surface, in the unit of the input."""
+    return nearest_triangles(points, nodes, triangles)[1] if len(points) else np.zeros(0)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from morph_dslam.model import Parameter, ReducedModel, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.messages import Ambiguity, Ambiguous, AttitudeArbitrary
+from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.symmetry import turn_warning, turns_alike
 from tests.support.bent_tube import polynomial
 
@@ -58,6 +59,31 @@ def test_a_box_that_stands_on_its_end_and_is_bent_is_ambiguous_and_one_that_is_s
     # The knob tells the sides apart.
     knob = trimesh.creation.box((0.006, 0.006, 0.006), trimesh.transformations.translation_matrix([0.005, 0.01, 0.05]))
     assert turn_warning(model_of(trimesh.util.concatenate([mesh, knob])), None) is None
+
+
+@pytest.mark.parametrize(("place", "expected"), [(0.0, AttitudeArbitrary), (0.02, Ambiguous)])
+def test_a_small_stamp_on_a_frustum_is_the_same_turned_where_it_is_in_the_middle(place, expected):
+    """Its field exp(-(r / a)^2), 8 mm wide on 80 mm, is exactly that of the turned one there."""
+    corners = [[x, y, 0.0] for x in (-0.05, 0.05) for y in (-0.05, 0.05)]
+    corners += [[x, y, 0.05] for x in (-0.04, 0.04) for y in (-0.04, 0.04)]
+    mesh = trimesh.convex.convex_hull(np.array(corners)).subdivide_to_size(0.004)
+    x, y, z = np.asarray(mesh.vertices).T
+    pressed = np.where(z > 0.0499, -0.004 * np.exp(-((x - place) ** 2 + y**2) / 0.008**2), 0.0)
+    assert isinstance(turn_warning(model_of(mesh, np.column_stack([0 * x, 0 * x, pressed])), None), expected)
+
+
+@pytest.mark.parametrize(("place", "expected"), [(0.0, AttitudeArbitrary), (0.05, Ambiguous)])
+def test_a_tube_pressed_from_a_side_is_the_same_turned_where_that_is_in_its_middle(place, expected):
+    """Any half turn across it is one about the side, and a turn about its length, which is a parameter."""
+    angles, heights = np.meshgrid(0.4 + 2.0 * np.pi * np.arange(36) / 36, np.linspace(-0.1, 0.1, 31), indexing="ij")
+    x, y, z = np.array([0.03 * np.cos(angles), 0.03 * np.sin(angles), heights]).reshape(3, -1)
+    at = np.arange(x.size).reshape(36, 31)
+    quads = np.stack([at[:, :-1], np.roll(at, -1, axis=0)[:, :-1], np.roll(at, -1, axis=0)[:, 1:], at[:, 1:]], axis=-1)
+    faces = quads.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    mesh = trimesh.Trimesh(np.column_stack([x, y, z]), faces, process=False)
+    pressed = -0.01 * np.exp(-(((z - place) / 0.04) ** 2)) * np.maximum(x / 0.03, 0.0)
+    model = model_of(mesh, np.column_stack([pressed, 0 * x, 0 * x]))
+    assert isinstance(turn_warning(model, Axis(np.zeros(3), np.array([0.0, 0.0, 1.0]))), expected)
 
 
 def _parts(mesh):

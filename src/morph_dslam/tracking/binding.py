@@ -159,15 +159,15 @@ def nearest_surface_points(nodes: Array, triangles: NDArray[np.int64], positions
     distances = np.zeros(len(positions))
     corners = nodes[triangles]
     for row, position in enumerate(positions):
-        candidates = _nearest_in_triangles(corners, position)
+        candidates = nearest_in_triangles(corners, position)
         gaps = np.linalg.norm(np.einsum("mc,mcx->mx", candidates, corners) - position, axis=1)
         best = int(gaps.argmin())
         chosen[row], weights[row], distances[row] = best, candidates[best], gaps[best]
     return SurfacePoints(chosen, weights), distances
 
 
-def _nearest_in_triangles(corners: Array, position: Array) -> Array:
-    """Barycentric weights (m, 3) of the nearest point of every triangle (m, 3, 3)."""
+def nearest_in_triangles(corners: Array, position: Array) -> Array:
+    """Barycentric weights (m, 3) of the point of every triangle (m, 3, 3) nearest to a position (3,), or to (m, 3)."""
     origin, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     offset = position - origin
     uu, uv, vv = (np.einsum("mx,mx->m", p, q) for p, q in ((u, u), (u, v), (v, v)))
