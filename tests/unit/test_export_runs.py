@@ -20,6 +20,7 @@ from morph_dslam.model.discrepancy import Discrepancy, DiscrepancyBasis
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.model.unknown_loads import SecondOrder, UnknownLoads, with_unknown_loads
 from morph_dslam.tracking.estimator import Estimate, State
+from morph_dslam.tracking.known_values import KnownValues
 from morph_dslam.tracking.outcomes import FoundBy, Rejection, RejectionReason, Status
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_folder import write_csv, write_hdf5
@@ -216,6 +217,22 @@ def test_a_parameter_called_as_a_column_of_the_pose(name, tmp_path):
     close([float(row["x_mm"]) for row in tracked], 1e3 * POSE.translation[0])
     states = StateChoice(path=folder / "frames.csv").states(block)
     np.testing.assert_allclose(states, [state[:2] for state in STATES.values()], rtol=1e-5)
+
+
+def test_a_parameter_called_as_the_deviation_of_another(tmp_path):
+    """x_std_mm is the one, and beside a pose's x_mm "x_std [mm]" the deviation of x; so it is where it is known."""
+    block = stretched_block_model()
+    stretch, slide = block.parameters
+    length = replace(stretch, name="x_std", quantity="length", unit="mm")
+    block = replace(block, parameters=(length, replace(slide, name="x")))
+    folder = write_run(tmp_path / "run", block, block)
+    states = [state[:2] for state in STATES.values()]
+    found = StateChoice(path=folder / "frames.csv").states(block)
+    np.testing.assert_allclose(found, states, rtol=1e-5)
+    known = KnownValues.read(folder / "frames.csv", block)
+    names = [block.parameters[k].name for k in known.indices]
+    rows = [dict(zip(names, known.by_frame[frame][:, 0].tolist(), strict=True)) for frame in STATES]
+    np.testing.assert_allclose([[row["x_std"], row["x"]] for row in rows], states, rtol=1e-5)
 
 
 def refused_for(model, match, **choice):

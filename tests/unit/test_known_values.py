@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,29 @@ def test_a_table_has_values_and_deviations_by_frame(tmp_path):
     # Half a percent of the range where no deviation is given; a value that is missing is not known.
     assert found.by_frame[21][1] == pytest.approx([0.031, 0.005 * 0.12])
     assert np.isnan([found.by_frame[21][0, 0], found.by_frame[23][1, 0]]).all()
+
+
+def test_titles_may_have_their_unit_in_brackets_and_a_parameter_may_be_called_as_a_deviation(tmp_path):
+    found = KnownValues.read(write(tmp_path, "frame,arch [mm],arch_std [mm]", "20,30,0.5"), MODEL)
+    assert found.by_frame[20] == pytest.approx(np.array([[0.03, 0.0005]]))
+    arch, skew, twist = MODEL.parameters
+    model = replace(MODEL, parameters=(replace(arch, name="gap_std"), skew, twist))
+    found = KnownValues.read(write(tmp_path, "frame,gap_std_mm,gap_std_std_mm", "20,30,0.5"), model)
+    assert found.by_frame[20] == pytest.approx(np.array([[0.03, 0.0005]]))
+
+
+def test_the_table_of_a_run_tells_what_the_run_found(tmp_path):
+    """Not the pose, nor parameters of another model, nor frames in which the object was lost."""
+    path = write(
+        tmp_path,
+        "frame,timestamp_s,status,pose_from,arch_mm,arch_std_mm,arch_at_bound,bend_deg,bend_std_deg,bend_at_bound,x_mm",
+        "20,0.1,tracked,points,30,0.5,0,10,1,0,7",
+        "21,0.2,lost,,,,,,,,",
+        "22,0.3,tracked,points,31,inf,0,10,1,0,7",
+    )
+    found = KnownValues.read(path, MODEL)
+    assert found.by_frame[20] == pytest.approx(np.array([[0.03, 0.0005]]))
+    assert np.isnan([found.by_frame[number][0, 0] for number in (21, 22)]).all()
 
 
 @pytest.mark.parametrize(

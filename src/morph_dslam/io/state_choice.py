@@ -20,6 +20,7 @@ from morph_dslam.io.run_states import RESULT, RunStates, load_run_states
 from morph_dslam.io.text import name_and_unit, read_csv
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.inner_structure import CarriedStructure
+from morph_dslam.model.parameters import columns_of_run
 from morph_dslam.model.unknown_loads import with_unknown_loads
 from morph_dslam.notices import Notice
 from morph_dslam.units import FACTORS, read_quantity, to_si
@@ -322,11 +323,13 @@ def _times(header: Sequence[str], rows: Sequence[list[str]]) -> Array | None:
 
 
 def _without_twins(header: Sequence[str]) -> list[str]:
-    """The titles, of a run's table without those that stand for a pose beside a parameter of their name: "x [mm]"."""
-    if "pose_from" not in header:
+    """The titles, of a run's table without deviations, and what stands for a pose beside a parameter "x [mm]"."""
+    of_run = columns_of_run(header)
+    if of_run is None:
         return list(header)
-    named = {name_and_unit(title) for title in header if title.endswith("]")}
-    return ["" if not title.endswith("]") and name_and_unit(title) in named else title for title in header]
+    titles = ["" if column in of_run.values() else title for column, title in enumerate(header)]
+    named = {name_and_unit(title) for title in titles if title.endswith("]")}
+    return ["" if not title.endswith("]") and name_and_unit(title) in named else title for title in titles]
 
 
 def _column_of(parameter: Parameter, header: Sequence[str], path: Path) -> tuple[int, str] | None:

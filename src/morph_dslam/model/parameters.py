@@ -76,6 +76,23 @@ def parameter_of_column(header: str, model: ReducedModel) -> tuple[str, float] |
     return None
 
 
+def columns_of_run(header: Sequence[str]) -> dict[int, int] | None:
+    """Of a run's ``frames.csv``, the columns of parameters' values, each with that of its deviation; None of others.
+
+    Values, deviations and whether they are at a bound are side by side. Titles alone do not tell "x_std [mm]", the
+    deviation of x, from "x_std_mm", the value of x_std.
+    """
+    if "pose_from" not in header:
+        return None
+    found = {}
+    for column, three in enumerate(zip(header, header[1:], header[2:], strict=False)):
+        name, unit = name_and_unit(three[0])
+        plain = f"{name}_{unit}", f"{name}_std_{unit}", f"{name}_at_bound"
+        if three in (plain, (f"{name} [{unit}]", f"{name}_std [{unit}]", f"{name} at_bound")):
+            found[column] = column + 1
+    return found
+
+
 def parameter_columns(model: ReducedModel) -> str:
     """How columns with the model's parameters are named, for messages."""
     return ", ".join(f"{parameter.name}_{parameter.unit}" for parameter in model.parameters)

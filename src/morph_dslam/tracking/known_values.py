@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.errors import ArgumentError, TrackingError, check_kind
-from morph_dslam.io.text import has_a_cell_for_each, read_csv
+from morph_dslam.io.text import has_a_cell_for_each, name_and_unit, read_csv
 from morph_dslam.model import Parameter, ReducedModel
-from morph_dslam.model.parameters import parameter_columns, parameter_of_column
+from morph_dslam.model.parameters import columns_of_run, parameter_columns, parameter_of_column
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.levenberg_marquardt import Box
 from morph_dslam.tracking.outcomes import TimeOutside
 from morph_dslam.tracking.state import moved
 
 Array = NDArray[np.float64]
-FRAME, STD = "frame", "_std_"
+FRAME, STD = "frame", "_std"
 #: An estimate is within so many standard deviations of what is known.
 FARTHEST = 3.0
 #: Without a deviation, a value is known to this part of its range.
@@ -54,6 +54,8 @@ class KnownValues:
     @classmethod
     def read(cls, path: Path, model: ReducedModel) -> KnownValues:
         """A CSV file with the columns ``frame`` and, by parameter, ``pressure_kPa`` and perhaps ``pressure_std_kPa``.
+
+        Of the ``frames.csv`` of a run, the columns of parameters of the model are taken.
 
         Raises
         ------
@@ -89,25 +91,22 @@ class KnownValues:
 class _Columns:
     """Where a table has what: of each of k parameters the columns of value and deviation, with their factors to SI.
 
-    A deviation that there is not is None.
+    A deviation that there is not is None. `is_of_run` says whether it is the table of a run.
     """
 
     frame: int
     indices: NDArray[np.int64]
     pairs: Sequence[Sequence[tuple[int, float] | None]]
     model: ReducedModel
+    is_of_run: bool
 
     @classmethod
     def of(cls, path: Path, header: Sequence[str], model: ReducedModel) -> _Columns:
         found: dict[str, dict[bool, tuple[int, float]]] = {}
-        for number, name in enumerate(header):
-            if name == FRAME:
-                continue
-            is_deviation = STD in name
-            parameter = parameter_of_column(name.replace(STD, "_"), model)
+        for number, is_deviation, parameter in _parameters_in(header, model):
             if parameter is None:
                 raise TrackingError(
-                    f"{path}: '{name}' is no column with a parameter of the model; write {FRAME}, "
+                    f"{path}: '{header[number]}' is no column with a parameter of the model; write {FRAME}, "
                     f"{parameter_columns(model)}, and deviations with _std before the unit"
                 )
             if is_deviation in found.setdefault(parameter[0], {}):
@@ -124,6 +123,7 @@ class _Columns:
             np.array([names.index(name) for name in named], dtype=np.int64),
             [(found[name][False], found[name].get(True)) for name in named],
             model,
+            columns_of_run(header) is not None,
         )
 
     def row(self, where: str, cells: Sequence[str]) -> tuple[int, Array]:
@@ -132,9 +132,35 @@ class _Columns:
         if not frame.is_integer():
             raise TrackingError(f"{where}: '{cells[self.frame]}' is no number of a frame")
         values = np.array([[_number(where, cells, *one) if one else np.nan for one in pair] for pair in self.pairs])
+        if self.is_of_run:  # where a run does not know how exact a value is, it does not know the value
+            values[~(np.isfinite(values[:, 1]) & (values[:, 1] > 0.0))] = np.nan
         for k, (value, deviation) in zip(self.indices.tolist(), values, strict=True):
             check_known(where, self.model, k, value, deviation)
         return int(frame), with_usual_deviations(self.model, self.indices, values)
+
+
+def _parameters_in(header: Sequence[str], model: ReducedModel) -> Iterator[tuple[int, bool, tuple[str, float] | None]]:
+    """Columns of a table, whether each holds a deviation, and the parameter, as of `parameter_of_column`.
+
+    Of a run's table these are the columns of parameters that the model has.
+    """
+    of_run = columns_of_run(header)
+    deviations = set() if of_run is None else set(of_run.values())
+    for number, title in enumerate(header):
+        if title == FRAME:
+            continue
+        parameter = None if number in deviations else parameter_of_column(title, model)
+        is_deviation = parameter is None
+        if is_deviation:
+            parameter = _parameter_of_deviation(title, model)
+        if of_run is None or (parameter is not None and number in {*of_run, *deviations}):
+            yield number, is_deviation, parameter
+
+
+def _parameter_of_deviation(header: str, model: ReducedModel) -> tuple[str, float] | None:
+    """The parameter whose deviation a column such as ``stroke_std_mm`` holds, as of `parameter_of_column`."""
+    name, unit = name_and_unit(header)
+    return parameter_of_column(f"{name.removesuffix(STD)} [{unit}]", model) if name.endswith(STD) else None
 
 
 def _number(where: str, cells: Sequence[str], column: int, factor: float = 1.0) -> float:
