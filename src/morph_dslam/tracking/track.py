@@ -387,8 +387,10 @@ class _Job:
 
     def _draw(self, number: int) -> None:
         """Draw the video of one object."""
-        folder, camera = self._folders[number], self._placed[number].camera
-        first = self._source.sources[0] if isinstance(self._source, SynchronizedFrames) else self._source
+        run, folder, camera = self._run, self._folders[number], self._placed[number].camera
+        first = self._source
+        if isinstance(first, SynchronizedFrames):  # which may read from the beginning, where a range is asked for
+            first = open_source(run.frames, run.first, run.last, run.fps)
         write_video(folder.path / "augmented.mp4", first, camera, folder.results, self._views[number])
 
     def _screens(self, stack: ExitStack) -> list[Sink]:
