@@ -214,7 +214,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     camera.check_image(frames[0].image, where)
     registration, images = part.register(cameras, frames), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
-    in_sequence = not run.live and number in (None, _first_number(run))
+    in_sequence = not run.live and (number is None or number == _first_number(run))
     placed = with_loads(registration, part.options)
     depth, scale = frames[0].depth if part.options.use_depth else None, registration.depth_scale
     if depth is not None and scale is not None:
