@@ -464,3 +464,22 @@ def test_landmarks_to_register_anew_are_of_their_frame(tmp_path, refused):
     words = [word for option, name in names.items() for word in (option, tmp_path / name)]
     later = f"7={tmp_path / 'later.csv'}"
     assert "set in frame 5 are used in frame 7" in refused("track", "film", *words, "--reregister-at", later)
+
+
+@pytest.mark.parametrize(("options", "used"), [([], "frame 0"), (["--reference-frame", "2"], "frame 2")])
+def test_a_guess_of_another_frame_is_not_used_in_the_reference_frame(options, used, tmp_path, refused):
+    save_model(tmp_path / "sheet.morph", MODEL)
+    save_camera(tmp_path / "camera.yaml", CAMERA)
+    (tmp_path / "film").mkdir()
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / "film" / f"{number}.png"), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    guess = "[pose]\nposition_mm = [0, 0, 600]\nrotation_deg = [180, 0, 0]\n"
+    names = {"--model": "sheet.morph", "--camera": "camera.yaml", "--guess": "guess.toml", "-o": "run"}
+    words = [word for option, name in names.items() for word in (option, tmp_path / name)]
+    (tmp_path / "guess.toml").write_text(f"frame = 3\n{guess}")
+    assert f"a guess of frame 3 is used in {used}" in refused("track", tmp_path / "film", *words, *options)
+    # In its own frame, or if it names none, the picture decides: there is nothing in it.
+    own = refused("track", tmp_path / "film", *words, "--reference-frame", "3")
+    (tmp_path / "guess.toml").write_text(guess)
+    for said in (own, refused("track", tmp_path / "film", *words, *options)):
+        assert "the image contradicts the guess" in said

@@ -29,7 +29,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.run_results import RunResults
-from morph_dslam.tracking.setup import TrackedObject
+from morph_dslam.tracking.setup import TrackedObject, check_guess
 from morph_dslam.tracking.synchronized import SynchronizedFrames
 from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.tracker_inputs import widened
@@ -212,6 +212,7 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     frames = frames_at(number)
     where = f"frame {frames[0].index} of {run.frames}" if run.reference_image is None else str(run.reference_image)
     camera.check_image(frames[0].image, where)
+    check_guess(start, frames[0].index)
     registration, images = part.register(cameras, frames), tuple(frame.image for frame in frames)
     # A sequence that does not begin with the reference frame is entered as if the object had been lost.
     in_sequence = not run.live and (number is None or number == _first_number(run))

@@ -17,6 +17,7 @@ from morph_dslam.io.landmarks import Landmarks, load_landmarks
 from morph_dslam.model import ReducedModel, load_model
 from morph_dslam.model.inner_structure import InnerStructure, load_inner_structures
 from morph_dslam.notices import Remark
+from morph_dslam.registration.guess import GuessInitializer
 from morph_dslam.registration.initialization import Initializer, register_by_initializer
 from morph_dslam.registration.landmarks import CLICK_PX, register_landmarks
 from morph_dslam.registration.registration import Registration, in_scene
@@ -127,12 +128,28 @@ def _check_frame(landmarks: Landmarks, frame: int, camera: int = 0) -> None:
     """Raise RegistrationError if landmarks in a camera of a rig say that they were set in another frame."""
     others = [] if landmarks.frames is None else sorted({*landmarks.frames.tolist()} - {frame})
     if others:
-        used = f"frame {frame}" if frame >= 0 else "the reference image"
         whose = f"landmarks of camera {camera}" if camera else "landmarks"
         raise RegistrationError(
-            f"{whose} that were set in frame {others[0]} are used in {used}: give those of that frame, choose the "
+            f"{whose} that were set in frame {others[0]} are used in {_name_of(frame)}: give those of that frame, choose the "
             "other one (--reference-frame), or leave out the column of frames if they belong there"
         )
+
+
+def check_guess(start: Registration | Landmarks | Initializer, frame: int) -> None:
+    """Raise RegistrationError if a guess says that it is of another frame than this one, the reference.
+
+    Where it registers an object anew, in a later frame, the picture alone decides.
+    """
+    guessed = start.guess.frame if isinstance(start, GuessInitializer) else None
+    if guessed is not None and guessed != frame:
+        raise RegistrationError(
+            f"a guess of frame {guessed} is used in {_name_of(frame)}: give one of that frame, choose the other one "
+            "(--reference-frame), or leave out its line 'frame' if it belongs there"
+        )
+
+
+def _name_of(frame: int) -> str:
+    return f"frame {frame}" if frame >= 0 else "the reference image"
 
 
 def load_cameras(run: TrackOptions) -> tuple[RigCamera, ...]:
