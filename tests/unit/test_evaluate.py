@@ -131,6 +131,12 @@ def test_results_in_memory_are_compared_with_depth(results):
         md.evaluate_depth(run, [])
 
 
+def test_times_of_results_in_memory_are_those_of_their_frames(results):
+    assert md.Run.of(CAMERA, results).timestamps is None
+    run = md.Run.of(CAMERA, {frame: results[frame] for frame in (12, 10)}, {9: 0.25, 10: 0.5, 12: 0.75})
+    np.testing.assert_array_equal(run.timestamps, [0.75, 0.5])
+
+
 def test_paths_in_memory_are_compared():
     """A path twice as long as the true one, which climbs steadily round a corner."""
     poses = np.tile(np.eye(4), (30, 1, 1))

@@ -1,6 +1,7 @@
 """Tracks in images against projections written by hand, then shifted by known amounts."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,63 @@ def test_a_known_shift_is_the_error_in_pixels_and_across_the_sight_line():
     assert figures["per_track"]["a"]["max_mm"] == pytest.approx(expected, rel=1e-6)
     assert figures["per_frame"]["23"]["mean_mm"] == pytest.approx(expected / 2.0, rel=1e-6)
     assert figures["per_frame"]["24"]["max_px"] < 1e-6
+
+
+#: Frames of a rolling shutter a thirtieth of a second apart; a sheet that slides faster and faster, metres along x.
+INTERVAL, READOUT = 1.0 / 30.0, 0.03
+ROLLING = replace(CAMERA, readout_s=READOUT)
+
+
+def slid(seconds):
+    return 0.1 * seconds + 1.2 * seconds**2
+
+
+def rolling_run(timestamps):
+    run = sliding_run(ROLLING)
+    run.camera_from_object[:, 0, 3] = slid(INTERVAL * np.arange(len(FRAMES)))
+    return replace(run, timestamps=timestamps)
+
+
+def by_rows():
+    """Pixels of `POINTS`, each at the instant of its row, which the slide does not change."""
+    pixels = projected()
+    instants = INTERVAL * np.arange(len(FRAMES))[:, None] + READOUT * (pixels[..., 1] - 239.5) / 480.0
+    pixels[..., 0] = 320.0 + 528.0 * (POINTS[:, 0] + slid(instants)) / DEPTH
+    return pixels
+
+
+def test_tracks_of_a_rolling_shutter_are_compared_where_its_rows_show_the_points():
+    """At the instant of the middle row, "b" is about 1 px elsewhere; a parabola is its path."""
+    exact = evaluate_pixels(rolling_run(INTERVAL * np.arange(len(FRAMES))), tracks(by_rows()))
+    assert exact["max_px"] < 1e-6
+    assert exact["max_mm"] < 1e-6
+    assert exact["notes"] == []
+    # Frame 22 is missing, and 23 has only later frames within the time.
+    times = INTERVAL * np.arange(len(FRAMES)) + np.where(FRAMES > 22, 1.0, 0.0)
+    run = rolling_run(times)
+    run.parameters[FRAMES == 22] = np.nan
+    gap = evaluate_pixels(run, tracks(by_rows()), bind_frame=24)
+    assert gap["per_frame"]["23"]["max_px"] < 1e-6
+    assert gap["notes"] == []
+
+
+def test_a_point_that_moves_across_the_rows_is_found_in_its_row():
+    """It goes down by w = 264 pixels a second: v = v0 + w (v - 239.5) r / 480, solved for v."""
+    run, times = sliding_run(ROLLING), INTERVAL * np.arange(len(FRAMES))
+    run.camera_from_object[:, 0, 3], run.camera_from_object[:, 1, 3] = 0.0, 0.3 * times
+    pixels, share = np.tile(projected()[:1], (len(FRAMES), 1, 1)), 264.0 * READOUT / 480.0
+    pixels[..., 1] = (pixels[..., 1] + 264.0 * times[:, None] - share * 239.5) / (1.0 - share)
+    run = replace(run, timestamps=times)
+    assert evaluate_pixels(run, tracks(pixels))["max_px"] < 1e-4
+
+
+@pytest.mark.parametrize("timestamps", [None, 0.5 * np.arange(len(FRAMES))])
+def test_a_rolling_shutter_whose_motion_is_not_known_is_named(timestamps):
+    figures = evaluate_pixels(rolling_run(timestamps), tracks(by_rows()))
+    assert figures["per_track"]["b"]["max_px"] > 0.5
+    (note,) = figures["notes"]
+    assert "20, 21, 22, 23, 24 and 25" in note
+    assert evaluate_pixels(sliding_run(), tracks(projected()))["notes"] == []
 
 
 def test_tracks_that_count_from_another_frame_are_named():

@@ -18,6 +18,7 @@ from morph_dslam.evaluation.frame_numbers import point_notes, track_notes
 from morph_dslam.evaluation.picture_axes import axes_notes
 from morph_dslam.evaluation.pixels import PixelTracks, load_tracks, pixel_error, summarise_pixels
 from morph_dslam.evaluation.points import PointTruth, load_truth, material_error, summarise
+from morph_dslam.evaluation.rolling_shutter import shutter_notes
 from morph_dslam.evaluation.run_folder import Run, load_run
 from morph_dslam.evaluation.trajectory import summarise_alignment
 from morph_dslam.evaluation.truth_in_camera import check_truth
@@ -148,6 +149,7 @@ def evaluate_pixels(
         "notes": [
             *axes_notes(tracked, measured, error, bind_frame),
             *track_notes(tracked, measured, error, bind_frame),
+            *shutter_notes(tracked, {*error.frames.tolist(), *error.bind_frames.tolist()}),
         ],
         "tracks": None if isinstance(tracks, PixelTracks) else str(tracks),
         **_counts(tracked),

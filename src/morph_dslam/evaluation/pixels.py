@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.points import OUTLINE_TOLERANCE_PX, bind_pixels, millimetres
+from morph_dslam.evaluation.rolling_shutter import RecordedNodes
 from morph_dslam.evaluation.run_folder import Run, frames_in_words
 from morph_dslam.io.text import read_csv
 from morph_dslam.model import SurfacePoints
@@ -147,7 +148,8 @@ def pixel_error(run: Run, tracks: PixelTracks, bind_frame: int | None = None) ->
     frames, recorded = tracks.frames[known], tracks.pixels[known]
     seen = np.isfinite(recorded[..., 0]) & np.isfinite(recorded[..., 1])
     starts = _starts(run, frames, seen, bind_frame)
-    points, n_outline = _bind(run, frames, recorded, starts)
+    nodes = RecordedNodes(run)
+    points, n_outline = _bind(run, nodes, frames, recorded, starts)
     bound = points.triangles >= 0
     columns = np.flatnonzero(bound)
     if not columns.size:
@@ -161,7 +163,9 @@ def pixel_error(run: Run, tracks: PixelTracks, bind_frame: int | None = None) ->
         )
     points = points.take(columns)
     masked = np.where(seen[..., None], recorded, np.nan)[:, columns]
-    errors = [_in_frame(run, frame, points, masked[i]) for i, frame in enumerate(frames.tolist()) if i in compared]
+    errors = [
+        _in_frame(run, nodes, frame, points, masked[i]) for i, frame in enumerate(frames.tolist()) if i in compared
+    ]
     names = np.array(tracks.ids, dtype=object)
     return PixelError(
         ids=tuple(names[columns]),
@@ -196,7 +200,9 @@ def _starts(run: Run, frames: NDArray[np.int64], seen: NDArray[np.bool_], bind_f
     return np.where(seen[found[0]], found[0], -1)
 
 
-def _bind(run: Run, frames: NDArray[np.int64], recorded: Array, starts: NDArray[np.int64]) -> tuple[SurfacePoints, int]:
+def _bind(
+    run: Run, nodes: RecordedNodes, frames: NDArray[np.int64], recorded: Array, starts: NDArray[np.int64]
+) -> tuple[SurfacePoints, int]:
     """The material points (p) of tracks, triangle -1 where there is none, and how many are bound to the outline."""
     triangles, weights = np.full(len(starts), -1, dtype=np.int64), np.zeros((len(starts), 3))
     n_outline = 0
@@ -204,7 +210,7 @@ def _bind(run: Run, frames: NDArray[np.int64], recorded: Array, starts: NDArray[
         columns = np.flatnonzero(starts == start)
         row = run.row(int(frames[start]))
         assert row is not None
-        points, n_near = bind_pixels(run, row, recorded[start, columns])
+        points, n_near = bind_pixels(run, row, recorded[start, columns], nodes.points(row))
         triangles[columns], weights[columns] = points.triangles, points.weights
         n_outline += n_near
     return SurfacePoints(triangles, weights), n_outline
@@ -222,12 +228,14 @@ def _nothing_bound(starts: NDArray[np.int64], untracked: Sequence[int], outside:
     )
 
 
-def _in_frame(run: Run, frame: int, points: SurfacePoints, recorded: Array) -> tuple[Array, Array]:
+def _in_frame(
+    run: Run, nodes: RecordedNodes, frame: int, points: SurfacePoints, recorded: Array
+) -> tuple[Array, Array]:
     """Errors in pixels (b, 2) and across the sight line (b,), metres, of tracks at ``recorded`` pixels (b, 2)."""
     row = run.row(frame)
     assert row is not None
     corners = run.model.triangles[points.triangles]
-    predicted = np.einsum("bc,bcx->bx", points.weights, run.camera_points(row)[corners])
+    predicted = np.einsum("bc,bcx->bx", points.weights, nodes.points(row)[corners])
     sight = run.camera.rays(run.camera.undistort_pixels(recorded))
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     along = np.einsum("bx,bx->b", predicted, sight)

@@ -145,8 +145,15 @@ class MaterialError:
         return np.linalg.norm(self.vectors - self.along_sight[..., None] * self.sight, axis=2)
 
 
-def bind_pixels(run: Run, row: int, recorded: Array) -> tuple[SurfacePoints, int]:
+def bind_pixels(run: Run, row: int, recorded: Array, nodes: Array | None = None) -> tuple[SurfacePoints, int]:
     """The surface points that pixels (p, 2) of the recorded image show, in the state estimated there.
+
+    Parameters
+    ----------
+    run : that was tracked.
+    row : of the frame.
+    recorded : (p, 2) pixels.
+    nodes : (n, 3) as the image shows them, camera frame, metres; by default as the state has them.
 
     Returns
     -------
@@ -154,7 +161,7 @@ def bind_pixels(run: Run, row: int, recorded: Array) -> tuple[SurfacePoints, int
     n_outline : how many missed it by less, and are bound to its outline.
     """
     pixels = run.camera.undistort_pixels(recorded)
-    nodes, triangles = run.camera_points(row), run.model.triangles
+    nodes, triangles = run.camera_points(row) if nodes is None else nodes, run.model.triangles
     points = pick_surface(nodes, triangles, run.camera.rays(pixels))
     missed = np.flatnonzero((points.triangles < 0) & np.isfinite(pixels).all(axis=1))
     if not missed.size:

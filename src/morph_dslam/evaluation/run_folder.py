@@ -45,6 +45,7 @@ class Run:
     discrepancies : what the shapes have beyond the model's, by row; empty where it was not looked for.
     covariances : (f, d + 6, d + 6) of parameters, rotation vector and translation, SI, NaN where not tracked; None of
         a run that has not kept them.
+    timestamps : (f,) seconds; None where they are not known. A rolling shutter needs them.
     """
 
     model: ReducedModel
@@ -57,10 +58,19 @@ class Run:
     stage_times: dict[str, Array]
     discrepancies: dict[int, Discrepancy] = field(default_factory=dict)
     covariances: Array | None = None
+    timestamps: Array | None = None
 
     @classmethod
-    def of(cls, camera: Camera, results: Mapping[int, FrameResult]) -> Run:
+    def of(
+        cls, camera: Camera, results: Mapping[int, FrameResult], timestamps: Mapping[int, float] | None = None
+    ) -> Run:
         """The run of results by frame number, as a `morph_dslam.Tracker` returns them.
+
+        Parameters
+        ----------
+        camera : that saw the frames.
+        results : by frame number.
+        timestamps : seconds, by frame number; None where they are not known.
 
         Raises
         ------
@@ -86,6 +96,7 @@ class Run:
             stage_times={"total": np.array([result.total_ms for result in found])},
             discrepancies={row: r.discrepancy for row, r in enumerate(found) if r.discrepancy is not None},
             covariances=np.array([result.covariance for result in found]),
+            timestamps=None if timestamps is None else np.array([timestamps[frame] for frame in results], dtype=float),
         )
 
     @property
@@ -150,6 +161,7 @@ def load_run(folder: str | Path) -> Run:
             stage_times=dict(zip(names, np.asarray(file["timings_ms"]).T, strict=True)),
             discrepancies=load_discrepancies(file),
             covariances=np.asarray(file["covariance"]).astype(float) if "covariance" in file else None,
+            timestamps=np.asarray(file["timestamp"]).astype(float),
         )
     if not len(run.frames):
         raise EvaluationError(f"{path} holds no frames: track again")
