@@ -140,6 +140,36 @@ def test_what_third_order_costs_too_much_for_is_compared_with_second(
     assert entry["method"] == "displacements of order 2 on the same cells"
 
 
+def test_where_third_order_does_not_converge_second_order_is_compared_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the most strained of two states, against both orders solved from rest to the end."""
+    study = asking_for(short_bar([1, 1, 3], "hex8"), 2)
+    snapshots = take_snapshots(study, tmp_path)
+    model, solve = certified_model(snapshots, study.reduction, study.name), HigherOrder.solve
+    most = max(snapshot.coordinates[0] for snapshot in snapshots.held_out)
+
+    def failing(self: HigherOrder, dofs: Any, mu: Any, in_time: Any) -> Any:
+        if self.problem.displacements.order == 3 and mu[0] == most:
+            raise SolverError("finer elements do not converge")
+        return solve(self, dofs, mu, in_time)
+
+    monkeypatch.setattr(HigherOrder, "solve", failing)
+    entry = discretisation_errors(study, snapshots, model, 0.0)
+    assert entry["method"].startswith("displacements of order 3 on the same cells, of order 2 in 1 of 2 states")
+    assert "left_out" not in entry
+    assert most in [state[0] for state in entry["coordinates"]]
+    assert isinstance(study, SolidStudy)
+    missing = []
+    for (push,) in entry["coordinates"]:
+        finer = study.problem(SolidOptions(order=2 if push == most else 3, serendipity=True))
+        truth = finer.nodal_displacement(loaded_state(finer, np.array([push])).dofs)
+        (own,) = (s.fields["displacement"] for s in snapshots.held_out if s.coordinates[0] == push)
+        missing.append(np.linalg.norm(own - truth, axis=1))
+    # Second order of so few cells is stiffer than the study's elements: the errors of both orders differ.
+    assert entry["errors"]["displacement"]["mean_mm"] == pytest.approx(1e3 * np.mean(missing), rel=0.05)
+
+
 def test_forces_that_statics_determine_have_no_mesh_error() -> None:
     """A soft bar bends far under a dead push at its end: whatever the elements, its support carries the push."""
     study = bar(order=2)

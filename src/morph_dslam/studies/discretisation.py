@@ -172,20 +172,41 @@ def _estimate(
     solving = _solving_seconds(study, sweep.problem, kept[chosen[0]], solves)
     announce(f"solving {len(chosen)} held-out states again with finer elements")
 
+    reached = dict[int, HigherOrder]()
+
     def solve_again(index: int, in_time: Callable[[], bool]) -> Snapshot:
-        state, pivots = kept[index], int(kept[index]["pivots"])
-        dofs, found = state["dofs"], None
-        for step in steps:
-            found = step.solve(dofs, state["mu"], in_time)
-            dofs = found.dofs
-        assert found is not None
-        _check_same_branch(finer.problem, found, pivots)
-        snapshot = _snapshot(finer.problem, found)
-        return replace(snapshot, outputs=snapshot.outputs | finer.reactions_in_balance(found))
+        step, found = _highest(steps, kept[index], in_time)
+        _check_same_branch(step.problem, found, int(kept[index]["pivots"]))
+        snapshot, reached[index] = _snapshot(step.problem, found), step
+        return replace(snapshot, outputs=snapshot.outputs | step.reactions_in_balance(found))
 
     solved, left_out = _solved_again(chosen, solve_again, _budget(study, max(seconds, solving)))
-    figures = _figures(model, snapshots, sweep.problem, finer.problem, solved)
+    orders = [reached[index].problem.displacements.order for index in solved]
+    finest = next(step.problem for step in steps if step.problem.displacements.order == max(orders))
+    figures = _figures(model, snapshots, sweep.problem, finest, solved)
+    if lower := [order for order in orders if order < max(orders)]:
+        figures["method"] += (
+            f", of order {lower[0]} in {len(lower)} of {len(orders)} states, where these do not converge"
+        )
     return figures | left_out
+
+
+def _highest(
+    steps: Sequence[HigherOrder], state: dict[str, Array], in_time: Callable[[], bool]
+) -> tuple[HigherOrder, State]:
+    """The last of the ``steps`` from one of the study's states that converges, and what it finds.
+
+    Raises OutOfTime, and SolverError where none converges.
+    """
+    found: list[State] = []
+    for step in steps:
+        try:
+            found.append(step.solve(found[-1].dofs if found else state["dofs"], state["mu"], in_time))
+        except SolverError:
+            if not found:
+                raise
+            break  # of the states that strain a body most, more must not be left out than need be
+    return steps[len(found) - 1], found[-1]
 
 
 def _chosen(study: SolidStudy | ShellStudy, snapshots: Snapshots, affordable: Callable[[], int]) -> list[int]:
