@@ -147,7 +147,7 @@ def surface_parts(points: Array, triangles: Indices) -> list[SurfacePart]:
     mesh = trimesh.Trimesh(points, triangles, process=False)
     corners, parts = np.asarray(mesh.triangles), _parts(mesh)
     boxes = np.array([(corners[part].min(axis=(0, 1)), corners[part].max(axis=(0, 1))) for part in parts])
-    turns, holders = [], []
+    turns, holders = list[int](), list[list[int]]()
     for part, (low, high) in zip(parts, boxes, strict=True):
         a, b, c = np.moveaxis(corners[part] - corners[part].mean(axis=(0, 1)), 1, 0)
         volume = np.sum(a * np.cross(b, c)) / np.linalg.norm(high - low) ** 3
