@@ -5,10 +5,12 @@ import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError, RegistrationError
+from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.registration.register import register
+from morph_dslam.registration.registration import KeyframePose, MapRegistration, load_registration, registration_in_map
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import map_from_colmap
@@ -75,6 +77,27 @@ def test_a_map_that_grew_has_one_keyframe_of_each_number():
     slam.map.add_keyframe(keyframe(20, 0.4))
     scene = finish_scene(slam, [SlamFrame(k, k / 30, SlamStatus.LOST) for k in range(90, 120)])
     assert [each.index for each in scene.keyframes] == [1000, 1020, 20]
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_a_registration_made_before_the_map_grew_is_one_of_it(rounds, tmp_path):
+    """Also where keyframes of the new recording have its numbers; the scene that it was made in stays as it was."""
+    known, model = Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH), bent_sheet_model(8, 6)
+    placed = MapRegistration(SimilarityTransform(1.0, np.eye(3), np.array([0, 0, 2.0])), model.nodes.mean(axis=0), None)
+    views = [KeyframePose(each.index, placed.pose_in(each.camera_from_world)) for each in known.keyframes]
+    registration_in_map(model, placed, views, {}).save(tmp_path / "registration.json")
+    scene = known
+    for _ in range(rounds):
+        slam = start_slam(Film([]), CAMERA, SlamOptions(extend=True), scene)
+        for number in (0, 20):
+            slam.map.add_keyframe(keyframe(number, 0.2 + 0.01 * (20 - number) + 0.02))
+        scene = finish_scene(slam, [SlamFrame(k, k / 30, SlamStatus.LOST) for k in range(90, 120)])
+    found = load_registration(tmp_path / "registration.json", model, scene)
+    assert [found.frame, *(view.frame for view in found.keyframes)] == [1000 * rounds + k for k in (20, 0, 20)]
+    there = next(each for each in scene.keyframes if each.index == found.frame)
+    np.testing.assert_array_equal(there.camera_from_world, at(0.2))
+    assert [each.index for each in known.keyframes] == [0, 20]
+    assert load_registration(tmp_path / "registration.json", model, known).frame == 20
 
 
 def test_landmarks_in_a_number_of_two_recordings_are_refused():

@@ -382,20 +382,55 @@ def state_covariance(of_pose: Array, n_parameters: int) -> Array:
 
 
 def in_scene(registration: Registration, scene: Scene) -> Registration:
-    """The registration with its scene; raises MapError if it was made in another one."""
-    keyframe = next((each for each in scene.map.keyframes if each.index == registration.frame), None)
-    name, in_map = scene.path or "the scene", registration.map_registration
-    if keyframe is None or in_map is None:
-        raise MapError(f"{name} is not the map of the registration: it has no keyframe {registration.frame}")
-    by_map, pose = in_map.pose_in(keyframe.camera_from_world), registration.state.camera_from_object
-    turn = np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T))
-    shift = np.linalg.norm(by_map.translation - pose.translation)
-    if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(pose.translation):
+    """The registration with its scene; raises MapError if it was made in another one.
+
+    Where the map has grown by other recordings since, the registration takes over the numbers that its keyframes have
+    now.
+    """
+    name, in_map, frame = scene.path or "the scene", registration.map_registration, registration.frame
+    poses = {each.index: each.camera_from_world for each in scene.map.keyframes}
+    # Each recording by which a map grows adds the same power of ten to the numbers of all keyframes before it.
+    added = [] if frame is None else [number - frame for number in poses if number >= frame]
+    added = sorted(more for more in added if more % 10 == 0)
+    if not added or in_map is None:
+        raise MapError(f"{name} is not the map of the registration: it has no keyframe {frame}")
+    more = min(added, key=lambda more: _apart_in(registration, in_map, poses, more))
+    assert frame is not None
+    turn, shift = _away(in_map, poses[frame + more], registration.state.camera_from_object)
+    if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(
+        registration.state.camera_from_object.translation
+    ):
         raise MapError(
             f"{name} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
-            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {registration.frame}"
+            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {frame}"
         )
-    return replace(registration, scene=scene)
+    views = tuple(replace(view, frame=view.frame + more) for view in registration.keyframes)
+    return replace(registration, scene=scene, frame=frame + more, keyframes=views)
+
+
+def _apart_in(
+    registration: Registration, in_map: MapRegistration, poses: dict[int, Array], more: int
+) -> tuple[int, float]:
+    """How far a map is from that of a registration whose keyframes' numbers are larger by so much in it.
+
+    Returns
+    -------
+    How many of the keyframes it has not, and the mean of what the object is off in the others, as a share of the
+    distance.
+    """
+    off = []
+    for view in registration.keyframes:
+        if view.frame + more in poses:
+            turn, shift = _away(in_map, poses[view.frame + more], view.pose)
+            off.append(turn + shift / float(np.linalg.norm(view.pose.translation)))
+    return len(registration.keyframes) - len(off), float(np.mean(off)) if off else np.inf
+
+
+def _away(in_map: MapRegistration, camera_from_world: Array, pose: RigidTransform) -> tuple[float, float]:
+    """By what (rad, metres) a camera_from_object is off that of a map's keyframe."""
+    by_map = in_map.pose_in(camera_from_world)
+    turn = float(np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T)))
+    return turn, float(np.linalg.norm(by_map.translation - pose.translation))
 
 
 def _state_content(state: State) -> dict[str, list]:

@@ -289,6 +289,13 @@ class RigidMap:
         for name in _ALL_POINT_ARRAYS:
             setattr(self, name, getattr(other, name).copy())
 
+    def copied(self) -> RigidMap:
+        """Another map that is what this one is now, and may change by itself."""
+        other = RigidMap(self.baseline_px)
+        other.camera_notes, other.has_given_lengths = self.camera_notes, self.has_given_lengths
+        other.copy_of(self)
+        return other
+
     def share(self, other: RigidMap) -> None:
         """Become what another map is now, at once: with the same arrays, which must not change any more."""
         self.usual_rms_px, self.keyframes = other.usual_rms_px, other.keyframes

@@ -264,7 +264,7 @@ def start_slam(
     with_depth = options.use_depth and isinstance(camera, Camera) and has_registered_depth(source)
     slam = Slam(camera, options, with_depth, threaded=isinstance(source, LiveStream))
     if isinstance(known, Scene):
-        slam.use_map(known.map)
+        slam.use_map(known.map.copied() if slam.options.extend else known.map)
         slam.is_of_other_recording = True
     elif known is not None:
         images = images or (source if isinstance(source, FrameSource) else None)
