@@ -61,6 +61,19 @@ def test_a_readout_time_counts_where_poses_are_given(readout_s):
     assert np.sqrt(np.mean((depths - 1.0) ** 2)) < 0.003
 
 
+@pytest.mark.parametrize("fps", [30.0, 240.0])
+def test_poses_by_numbers_belong_to_the_frames_of_these_numbers_at_any_rate(fps):
+    """Every third frame has a pose: the others are left out, where the poses beside are 4 ms away too."""
+    wall = Wall(0.0)
+    wall.fps, wall.frames = fps, [replace(frame, timestamp=frame.index / fps) for frame in wall.frames]
+    numbers = np.arange(0, len(wall), 3)
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, 3] = (numbers / FPS)[:, None] * VELOCITY
+    found = map_from_trajectory(Trajectory(numbers.astype(float), poses, is_numbered=True), wall, FrameImages(CAMERA))
+    assert all(keyframe.index % 3 == 0 for keyframe in found.keyframes)
+    assert np.sqrt(np.mean((found.positions[found.good, 2] - 1.0) ** 2)) < 0.003
+
+
 @pytest.mark.parametrize("hz", [30, 100, 500])
 def test_noise_of_poses_moves_rows_by_no_more_than_itself_however_dense_they_are(hz):
     """Of a camera that stands still, poses have 0.05 degrees of noise about each axis; 30 ms are read in."""

@@ -48,9 +48,11 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
 
     Raises MapError if fewer than three frames have a pose, or too few points obey the poses.
     """
-    is_numbered = trajectory.is_numbered
+    is_numbered, instants = trajectory.is_numbered, trajectory.timestamps
+    # Numbers are whole: the nearest one is that of another frame where it is off.
+    most_apart = 0.5 if is_numbered else MOST_TIME_DIFFERENCE
     if is_numbered:
-        trajectory = replace(trajectory, timestamps=trajectory.timestamps / source.fps)
+        trajectory = replace(trajectory, timestamps=instants / source.fps)
     rigid_map = RigidMap()
     rigid_map.has_given_lengths = True
     mapper = Mapper(rigid_map, images.camera, hold_poses=True, unknown_depth=FAR * trajectory.length)
@@ -61,9 +63,9 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
     # A motion capture system gives many poses while one image is read out.
     twists = velocities(trajectory.timestamps, poses, abs(images.camera.readout_s))
     for frame in source:
-        times.append(frame.index / source.fps if is_numbered else frame.timestamp)
-        nearest = int(np.abs(trajectory.timestamps - times[-1]).argmin())
-        if abs(trajectory.timestamps[nearest] - times[-1]) > MOST_TIME_DIFFERENCE:
+        times.append(float(frame.index) if is_numbered else frame.timestamp)
+        nearest = int(np.abs(instants - times[-1]).argmin())
+        if abs(instants[nearest] - times[-1]) > most_apart:
             continue
         n_posed += 1
         pose, twist = poses[nearest], twists[nearest]
@@ -77,26 +79,30 @@ def map_from_trajectory(trajectory: Trajectory, source: FrameSource, images: Fra
         if mapper.wants_keyframe(tracked, view.index):
             do_all(mapper.insert(tracked, view))
             tracker.points = rigid_map.keyframes[-1].seen
-    _check(trajectory, source, n_posed, times, rigid_map, check.fault())
+    if n_posed < 3:
+        raise _too_few_posed(n_posed, times, instants, is_numbered, source.name)
+    _check(source, rigid_map, check.fault())
     mapper.complete()
     return rigid_map
 
 
-def _check(
-    trajectory: Trajectory,
-    source: FrameSource,
-    n_posed: int,
-    times: list[float],
-    rigid_map: RigidMap,
-    fault: str | None,
-) -> None:
-    """Refuse what gives no map, or a wrong one; ``fault``: of the poses."""
-    if n_posed < 3:
-        raise MapError(
-            f"only {n_posed} of {len(times)} frames of {source.name} have a pose: they are from "
-            f"{times[0]:.3f} to {times[-1]:.3f} s, the trajectory's from {trajectory.timestamps[0]:.3f} to "
-            f"{trajectory.timestamps[-1]:.3f} s, and may differ by {1e3 * MOST_TIME_DIFFERENCE:.0f} ms"
+def _too_few_posed(n_posed: int, times: list[float], instants: Array, is_numbered: bool, name: str) -> MapError:
+    """That too few frames have a pose; ``times`` of frames and ``instants`` of poses are seconds, or numbers."""
+    ends = times[0], times[-1], instants[0], instants[-1]
+    if is_numbered:
+        first, last, first_pose, last_pose = (f"{number:.0f}" for number in ends)
+        why = f"their numbers are {first} to {last}, those of the poses {first_pose} to {last_pose}"
+    else:
+        first, last, first_pose, last_pose = (f"{time:.3f}" for time in ends)
+        why = (
+            f"they are from {first} to {last} s, the trajectory's from {first_pose} to {last_pose} s, and may differ "
+            f"by {1e3 * MOST_TIME_DIFFERENCE:.0f} ms"
         )
+    return MapError(f"only {n_posed} of {len(times)} frames of {name} have a pose: {why}")
+
+
+def _check(source: FrameSource, rigid_map: RigidMap, fault: str | None) -> None:
+    """Refuse what gives no map, or a wrong one; ``fault``: of the poses."""
     share = float(rigid_map.n_found.sum() / max(rigid_map.n_expected.sum(), 1))
     misfit = f"the poses of the trajectory do not fit the images of {source.name}"
     if fault:
