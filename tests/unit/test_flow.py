@@ -170,6 +170,18 @@ def test_drawing_in_one_pass_equals_drawing_in_two(closed):
     assert np.abs(image - expected).max() <= 0.6
 
 
+def test_a_place_that_is_no_number_has_the_grey_of_the_border():
+    """As a triangle may have that the reference camera sees edge-on."""
+    texture, coordinates = pack_texture(np.full((37, 53), 90, np.uint8)), np.full((1, 3, 3), np.nan)
+    grey, depth, ids = np.zeros((40, 40), np.float32), np.full((40, 40), np.inf, np.float32), np.full((40, 40), -1)
+    corners = np.array([[5.0, 5.0], [35.0, 6.0], [12.0, 33.0]])
+    draw_textured(
+        corners, np.ones(3), np.arange(3)[None], coordinates, texture, False, grey, depth, ids.astype(np.int32)
+    )
+    assert np.isfinite(depth).sum() > 300
+    assert (grey[np.isfinite(depth)] == 90.0).all()
+
+
 @pytest.mark.parametrize("off_px", [0.01, 0.04])
 def test_places_do_not_depend_on_where_the_reference_view_is_rendered(off_px):
     """A frame that is the reference picture, compared with that picture rendered hundredths of a pixel beside it."""

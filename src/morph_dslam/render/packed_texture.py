@@ -31,8 +31,9 @@ def pack_texture(grey):
 @njit(cache=True, nogil=True, error_model="numpy")
 def grey_at(packed, x, y):
     """Grey level of a packed texture at a place in `PARTS` of a pixel, float32, bilinear; outside it is its border."""
-    column = np.uint32(min(max(x, 0.0), PARTS * (packed.shape[1] - 1)) + 0.5)
-    row = np.uint32(min(max(y, 0.0), PARTS * (packed.shape[0] - 1)) + 0.5)
+    # In this order NaN, of a triangle seen edge-on, is the border too.
+    column = np.uint32(min(max(0.0, x), PARTS * (packed.shape[1] - 1)) + 0.5)
+    row = np.uint32(min(max(0.0, y), PARTS * (packed.shape[0] - 1)) + 0.5)
     return np.float32(interpolated(packed[row >> _BITS, column >> _BITS], column & _MASK, row & _MASK)) * _OF_LEVEL
 
 

@@ -128,7 +128,7 @@ def draw_textured(pixels, depths, triangles, coordinates, texture, closed, grey,
     ----------
     pixels, depths, triangles, closed : see `rasterise`.
     coordinates : (m, 3, 3) column and row of each triangle's corners in the texture, texture pixels, times their depth
-        in the camera that took it, and that depth; outside it is its border
+        in the camera that took it, and that depth; outside, and where they are NaN, it is its border
     texture : (H, W) of `pack_texture`.
     grey, depth, triangle_ids : (h, w) float32, float32, the unit of ``depths``, and int32; changed where the surface is
         nearest.
