@@ -93,12 +93,13 @@ def find_inputs(folder: str | Path) -> FoundInputs:
     """What a folder holds of a run's inputs.
 
     Files are known by their keys, columns and first bytes; of folders below it only recordings, and what
-    `morph register` writes, count.
+    `morph register` writes, count. Hidden ones do not.
     """
     folder = Path(folder)
     described = {path: _keys(path, tomllib.loads) for path in _files(folder, ".toml")}
     studies = tuple(path for path, keys in described.items() if _OF_A_STUDY & keys)
-    places = [*_files(folder, ".json"), *sorted(folder.glob("*/registration.json"))]
+    below = [path for path in _entries(folder) if path.is_dir()]
+    places = [*_files(folder, ".json"), *(path / "registration.json" for path in below)]
     starts = [("registration", path) for path in places if "world_from_object" in _keys(path, json.loads)]
     starts += [("landmarks", path) for path in _files(folder, ".csv") if _first_row(path) == list(HEADER)]
     starts += [
@@ -107,14 +108,19 @@ def find_inputs(folder: str | Path) -> FoundInputs:
         for name, own in _STARTS.items()
         if own <= keys and not keys & (_OF_A_STUDY | _OF_A_SCENE)
     ]
-    inside = [path for path in sorted(folder.iterdir()) if path.is_dir() or file_kind(path) in VIDEOS]
+    inside = [path for path in _entries(folder) if path.is_dir() or file_kind(path) in VIDEOS]
     recordings = [path for path in inside if _is_recording(path)] or [folder] * _is_recording(folder)
     cameras = tuple(path for path in _files(folder, ".yaml", ".yml", ".txt") if _is_camera(path))
     return FoundInputs(folder, tuple(recordings), cameras, tuple(_files(folder, ".morph")), studies, tuple(starts))
 
 
 def _files(folder: Path, *endings: str) -> list[Path]:
-    return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in endings and path.is_file()]
+    return [path for path in _entries(folder) if path.suffix.lower() in endings and path.is_file()]
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder, without hidden files, as those that some systems put beside each file."""
+    return [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
 
 
 def _keys(path: Path, parse: Callable[[str], object]) -> set[str]:

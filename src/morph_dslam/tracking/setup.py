@@ -130,8 +130,8 @@ def _check_frame(landmarks: Landmarks, frame: int, camera: int = 0) -> None:
     if others:
         whose = f"landmarks of camera {camera}" if camera else "landmarks"
         raise RegistrationError(
-            f"{whose} that were set in frame {others[0]} are used in {_name_of(frame)}: give those of that frame, choose the "
-            "other one (--reference-frame), or leave out the column of frames if they belong there"
+            f"{whose} that were set in frame {others[0]} are used in {_name_of(frame)}: give those of that frame, "
+            "choose the other one (--reference-frame), or leave out the column of frames if they belong there"
         )
 
 
