@@ -79,6 +79,16 @@ def test_a_map_that_grew_has_one_keyframe_of_each_number():
     assert [each.index for each in scene.keyframes] == [1000, 1020, 20]
 
 
+def test_a_known_map_is_kept_however_long_the_camera_is_elsewhere():
+    """One of few keyframes that is to grow, too: only a map that was begun in this recording is given up."""
+    known = Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH)
+    slam = start_slam(Film([]), CAMERA, SlamOptions(extend=True, restart_after=2), known)
+    for number in range(5):
+        slam.process_frame(np.zeros((480, 640), np.uint8), number, number / 30)
+    assert slam.n_restarts == 0
+    np.testing.assert_array_equal(slam.map.positions, POINTS)
+
+
 @pytest.mark.parametrize("rounds", [1, 2])
 def test_a_registration_made_before_the_map_grew_is_one_of_it(rounds, tmp_path):
     """Also where keyframes of the new recording have its numbers; the scene that it was made in stays as it was."""

@@ -184,7 +184,7 @@ class Slam:
             if not self.is_frozen:
                 self._making.end_frame()
             self._n_lost = self._n_lost + 1 if frame.status is SlamStatus.LOST else 0
-            is_young = len(self.map.keyframes) < WINDOW and not self.is_frozen
+            is_young = len(self.map.keyframes) < WINDOW and not (self.is_frozen or self.knows_map)
             if is_young and self._n_lost > self.options.restart_after:
                 self._restart()
         is_beside |= self.threaded and self.is_mapping
