@@ -24,7 +24,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.other_tilt import LIKELIER, find_other_tilt
 from morph_dslam.tracking.outcomes import DepthNotUsed
 from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
-from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found
+from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found, mean_square
 from morph_dslam.tracking.patches import zero_where_unknown
 from morph_dslam.tracking.reference import ReferenceView
 from morph_dslam.tracking.reference_misfit import Unexplained
@@ -388,9 +388,10 @@ class FrameEstimation:
         return attempt
 
     def _supporting(self, attempt: PoseHypothesis, estimate: Estimate) -> tuple[Array, Array, float]:
-        """Pixels and residuals (p, 2) of the texture's points that support an estimate, and their spread."""
-        rows = attempt.inliers
-        return attempt.measurement.pixels[rows], estimate.residuals[: len(rows)][rows], estimate.sigma_px
+        """Pixels and residuals (p, 2) of the texture's points that support an estimate, and a number's variance."""
+        rows, n_unknowns = attempt.inliers, len(self._estimator.scale)
+        residuals = estimate.residuals[: len(rows)][rows]
+        return attempt.measurement.pixels[rows], residuals, mean_square(residuals, attempt.weights[rows], n_unknowns)
 
     def _with_outline(self, attempt: PoseHypothesis, seen: OutlineMeasurement) -> Observations:
         """The supporting points and the outline together."""

@@ -13,6 +13,7 @@ import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX as LEAST_NOISE_PX
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.outline import OutlineMeasurement
 
@@ -148,9 +149,20 @@ class OutlineBalance:
         variance = robust**2 * len(across) / left
         self.outline.learn(seen.pixels[used][near], across[near, None], float(variance))
 
-    def learn_texture(self, pixels: Array, residuals: Array, sigma_px: float) -> None:
-        """Take in the residuals (p, 2) of the points at ``pixels`` (p, 2) that agree, and their robust spread."""
-        self.texture.learn(pixels, residuals, sigma_px**2)
+    def learn_texture(self, pixels: Array, residuals: Array, variance: float) -> None:
+        """Take in the residuals (p, 2) of the points at ``pixels`` (p, 2) that agree, and a number's variance."""
+        self.texture.learn(pixels, residuals, variance)
+
+
+def mean_square(residuals: Array, weights: Array, n_unknowns: int) -> float:
+    """Variance of a number of weight one, by residuals (p, 2) with weights (p,), a few unknowns being fitted to them.
+
+    Points that are far off count in an estimate by their squares, so that the mean says how exact it is: a median tells
+    of the better half. Among few points of a smooth surface some are always worse, such as those near its rim.
+    """
+    numbers = 2 * len(residuals)
+    left = max(numbers - n_unknowns, LEAST_LEFT * numbers, 1)
+    return max(float(weights @ np.sum(residuals**2, axis=1)) / left, LEAST_NOISE_PX**2)
 
 
 @njit(cache=True, nogil=True)
