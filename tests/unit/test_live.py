@@ -341,6 +341,23 @@ def test_frames_come_over_a_socket_and_pictures_go_back(sender):
         stream.show(8, b"picture")  # for nobody
 
 
+def test_times_over_a_socket_are_without_the_jitter_with_which_frames_came(sender):
+    """A browser's frames, thirty a second, which the other program gets up to 4 ms late."""
+    path, listening = sender
+    jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    true = np.arange(90) / 30.0
+    received, found = true + np.random.default_rng(0).uniform(0.0, 4e-3, len(true)), []
+    with open_live(path) as stream:
+        other, _ = listening.accept()
+        with other:
+            for number, seconds in enumerate(received):
+                other.sendall(sent(number, jpeg, seconds))
+                found.append(next(iter(stream)).timestamp)
+    settled = slice(40, None)
+    assert np.std((found - true)[settled]) < 0.75 * np.std((received - true)[settled])
+    assert np.std(np.diff(found)[settled]) < 0.25 * np.std(np.diff(received)[settled])
+
+
 def test_a_socket_is_let_go_while_nothing_comes(sender):
     path, listening = sender
     stream = open_live(path)

@@ -20,6 +20,7 @@ import numpy as np
 from morph_dslam.errors import SourceError
 from morph_dslam.sources.frames import ASSUMED_FPS, Frame
 from morph_dslam.sources.live import LiveStream
+from morph_dslam.sources.steady_times import SteadyTimes
 
 #: Of a frame: its number, its time in seconds, bytes of its JPEG.
 FRAME_HEAD = struct.Struct("<IdI")
@@ -34,7 +35,8 @@ _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 class SocketCamera(LiveStream):
     """Frames that another program sends, which gets pictures of them in return.
 
-    A frame that cannot be decoded is left out. The stream ends when the other program closes the connection.
+    A frame that cannot be decoded is left out. The stream ends when the other program closes the connection. The times
+    that it sends are those at which it got the frames: they are smoothed as those of a camera on this computer.
 
     Parameters
     ----------
@@ -49,12 +51,13 @@ class SocketCamera(LiveStream):
         self.start()
 
     def read(self) -> Iterator[Frame]:
+        times = SteadyTimes()
         while head := self._exactly(FRAME_HEAD.size):
             index, seconds, size = FRAME_HEAD.unpack(head)
             if size > MOST_BYTES:
                 raise SourceError(f"{self.name} sent {size} bytes as frame {index}: a frame has {MOST_BYTES} at most")
             data = self._exactly(size)
-            captured = time.monotonic()
+            captured, seconds = time.monotonic(), times.add(seconds)
             image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _FLAGS) if data else None
             if image is not None:
                 yield Frame(index, seconds, np.asarray(image, dtype=np.uint8), captured=captured)
