@@ -151,9 +151,10 @@ def test_depth_of_another_scale_than_the_known_map_is_refused(with_depth, metric
 def test_a_map_is_not_overwritten_with_depth_of_another_scale(tmp_path, with_depth, refused):
     camera = write_tum(tmp_path / "recording", with_depth.frames[:8])
     run = tmp_path / "run"
-    command = ["slam", tmp_path / "recording", "--camera", camera, "--no-video", "-o", run]
+    command = ["slam", tmp_path / "recording", "--camera", camera, "-o", run]
     assert main([str(word) for word in command]) == 0
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    assert run / "tracked.mp4" in before
     wrong = ["--map", run / "map.h5", "--extend", "--overwrite", "--depth-per-metre", 1000]
     assert "contradict" in refused(*command, *wrong)
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before

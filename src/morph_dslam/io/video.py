@@ -78,6 +78,10 @@ class VideoWriter:
         self._writer.write(np.ascontiguousarray(image))
         self.n_frames += 1
 
+    def discard(self) -> None:
+        """Forget what was written so far: leaving the context then, an older file stays."""
+        self.n_frames = 0
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:

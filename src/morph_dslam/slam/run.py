@@ -159,8 +159,6 @@ def run_slam(
             again = stream if isinstance(stream, FrameSource) and known is None else None
         except MapError:
             frames.clear()  # nothing of a run whose depth contradicts the map may replace an earlier one
-            if video:  # nor be in the way of the next
-                (output / _VIDEO).unlink(missing_ok=True)
             raise
         except SourceError as error:
             if not frames:
@@ -211,5 +209,10 @@ def _track(slam: Slam, stream: FrameStream, frames: list[SlamFrame], video: Path
     size = (slam.camera.width, slam.camera.height)
     with VideoWriter(video, stream.fps, size) if video else nullcontext() as writer:
         watch = (lambda image, frame: writer.write(draw_frame(image, frame))) if writer else None
-        for frame in track_frames(slam, stream, progress, watch):
-            frames.append(frame)
+        try:
+            for frame in track_frames(slam, stream, progress, watch):
+                frames.append(frame)
+        except MapError:
+            if writer:
+                writer.discard()
+            raise
