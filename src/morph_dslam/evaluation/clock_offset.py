@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
@@ -47,7 +49,7 @@ def clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float,
     if rough is None:
         return None
     bounds = (rough - 2.0 * step, rough + 2.0 * step)
-    exact = scipy.optimize.minimize_scalar(lambda s: _error(estimate, truth, s), bounds=bounds, method="bounded")
+    exact: Any = scipy.optimize.minimize_scalar(lambda s: _error(estimate, truth, s), bounds=bounds, method="bounded")
     offset, after = float(exact.x), float(exact.fun)
     return (offset, before, after) if after < LEAST_LEFT * before else None
 

@@ -114,7 +114,7 @@ def _best_convention(estimate: Trajectory, truth: Trajectory) -> tuple[str, Traj
     ]
     turns = np.array([_turn_difference(own, true) for _, own, true in ways])
     alike = np.flatnonzero(turns <= CLEARLY * turns.min() + ROUNDING_DEG)
-    errors = np.array([aligned_error(*(path.positions for path in ways[row][1:])) for row in alike])
+    errors = np.array([aligned_error(ways[row][1].positions, ways[row][2].positions) for row in alike])
     return ways[alike[np.flatnonzero(errors <= CLEARLY * errors.min())[0]]]
 
 

@@ -169,7 +169,7 @@ def _markers(points: MeasuredPoints) -> NDArray[np.int64]:
         places, which = np.unique(points.places[rows], axis=0, return_inverse=True)
         of_place = np.full(len(places), -1)
         if len(known):
-            away, nearest = KDTree(known).query(places)
+            away, nearest = map(np.asarray, KDTree(known).query(places))
             order = np.argsort(away, kind="stable")
             order = order[away[order] <= most]
             taken = order[np.unique(nearest[order], return_index=True)[1]]  # of several, the nearest

@@ -200,7 +200,8 @@ class _Expansion:
         found = (rotation @ self.coefficients[part]).T
         if task.options.format == "polynomial":
             return polynomial_functions(task.box, self.indices, found)
-        return chebyshev_train(*task.box.T, self.indices, found, tolerance)
+        lower, upper = task.box.T
+        return chebyshev_train(lower, upper, self.indices, found, tolerance)
 
 
 def _on_grid(task: ReductionTask, sampled: _SampledFields) -> _Grid:

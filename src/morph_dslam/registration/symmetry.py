@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ def deforms_alike(model: ReducedModel, about: Axis, angle: float, axis: Axis | N
     coarse = np.arange(0.0, 2.0 * np.pi, COARSE)
     nearly = [most.nearly_apart(fields, axis, further) for further in coarse]
     best = coarse[int(np.argmin(nearly))]
-    found = minimize_scalar(
+    found: Any = minimize_scalar(
         lambda further: most.apart(axis, further), bounds=(best - COARSE, best + COARSE), options={"xatol": FINE}
     )
     return fields.apart(axis, float(found.x)) <= SAME_DISPLACEMENTS

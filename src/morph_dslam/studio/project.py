@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from morph_dslam.errors import StudioError
 
@@ -31,7 +31,7 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,99}")
 _MEGABYTE = 1_000_000
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
-Arguments, Result = ParamSpec("Arguments"), TypeVar("Result")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -293,16 +293,16 @@ def stamp(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def read_once(most: int) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+def read_once(most: int) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """Keep what a function of paths gives, for so many of them, until a file, or one in a folder, is written again."""
 
-    def keeping(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    def keeping(function: Callable[..., Result]) -> Callable[..., Result]:
         @lru_cache(maxsize=most)
-        def kept(seals: tuple, *paths: Any) -> Result:
+        def kept(seals: tuple, *paths: Path) -> Result:
             return function(*paths)
 
         @wraps(function)
-        def read(*paths: Arguments.args, **none: Arguments.kwargs) -> Result:
+        def read(*paths: Path) -> Result:
             return kept(tuple(map(_seal, paths)), *paths)
 
         return read
@@ -310,7 +310,7 @@ def read_once(most: int) -> Callable[[Callable[Arguments, Result]], Callable[Arg
     return keeping
 
 
-def _seal(path: Any) -> tuple:
+def _seal(path: Path) -> tuple:
     return tuple((file.name, *stamp(file)) for file in sorted(path.iterdir())) if path.is_dir() else stamp(path)
 
 

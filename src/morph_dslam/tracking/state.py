@@ -65,7 +65,7 @@ class BoundPoints:
         field = self.field.with_modes(self.field.modes[:, rows])
         return BoundPoints(self.surface.take(rows), self.rest[rows], field)
 
-    def in_state(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
+    def in_state(self, state: State) -> tuple[Array, Array, Array, Array, NDArray[np.floating]]:
         """What compiled functions take of the points in a state; see `reprojection.linearise`."""
         pose = state.camera_from_object
         rows = self.field.functions.rows(state.parameters)

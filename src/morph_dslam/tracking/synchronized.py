@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
@@ -180,8 +181,8 @@ def _renumbered(frame: Frame, number: int) -> Frame:
     """A frame with the number of its instant."""
     if frame.index == number:
         return frame
-    own = {each.name: getattr(frame, each.name) for each in fields(Frame)}
-    return RenumberedFrame(**own | {"index": number}, own_index=frame.index)
+    own: dict[str, Any] = {each.name: getattr(frame, each.name) for each in fields(Frame)}
+    return RenumberedFrame(**{**own, "index": number, "own_index": frame.index})
 
 
 class _Clocks:
