@@ -19,8 +19,7 @@ import numpy as np
 
 from morph_dslam.errors import SourceError
 from morph_dslam.sources.frames import ASSUMED_FPS, Frame
-from morph_dslam.sources.live import LiveStream
-from morph_dslam.sources.steady_times import SteadyTimes
+from morph_dslam.sources.live import LiveStream, SteadyTimes
 
 #: Of a frame: its number, its time in seconds, bytes of its JPEG.
 FRAME_HEAD = struct.Struct("<IdI")
