@@ -36,20 +36,27 @@ def removed_on_failure(path: Path) -> Iterator[None]:
         raise
 
 
-def check_no_input(outputs: Iterable[Path], inputs: Iterable[str | Path | None], kind: type[MorphError]) -> None:
+def check_no_input(
+    outputs: Iterable[Path],
+    inputs: Iterable[str | Path | None],
+    kind: type[MorphError],
+    folders_are_emptied: bool = False,
+) -> None:
     """Raise an error of a kind if a file that is to be written is one of those that are read.
 
     Parameters
     ----------
-    outputs : files to write, and folders whose files are written, whether they are there or not.
+    outputs : files to write, whether they are there or not.
     inputs : files and folders that are read; None for what is not given.
     kind : of the error.
+    folders_are_emptied : whether folders among the outputs lose the files that they hold.
     """
     given = [Path(path) for path in inputs if path is not None]
     for output in outputs:
         for path in given:
             with suppress(OSError):  # it is not there
-                is_it, is_in_it = path.samefile(output), output.resolve() in path.resolve().parents
+                is_it = path.samefile(output)
+                is_in_it = folders_are_emptied and output.resolve() in path.resolve().parents
                 if is_it or is_in_it:
                     raise kind(
                         f"{path if is_in_it else output} is an input of this command, and would be overwritten: write "

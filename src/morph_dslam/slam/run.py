@@ -131,7 +131,7 @@ def run_slam(
     written = [*replaced_files(output, "slam"), *(output / name for name in (*more_files, *gone))]
     grown = map_path if options.extend else None  # it may take its own place
     given = [source, str(camera).partition("#")[0], None if grown else map_path, trajectory, images]
-    check_no_input(written, given, MapError)
+    check_no_input(written, given, MapError, folders_are_emptied=True)
     one_or_two = load_camera_or_pair(camera)
     stream = open_stream(source, first, last, fps, depth_per_metre)
     more: dict[str, Any] = {"inputs": {"source": str(source), "camera": str(camera)}}

@@ -132,7 +132,7 @@ def prepare(run: TrackOptions, stack: ExitStack) -> tuple[TrackOptions, Source, 
     """
     check_options(run)
     outputs = [path for folder in run.folders for path in replaced_files(folder)]
-    check_no_input(outputs, run.input_files, TrackingError)
+    check_no_input(outputs, run.input_files, TrackingError, folders_are_emptied=True)
     if run.frame_log is not None:
         check_frame_log(run.frame_log, run.input_files)
     cameras = load_cameras(run)
