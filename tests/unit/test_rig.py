@@ -283,10 +283,16 @@ def estimated(model, pictures, depth_weight=None):
     return estimator.fit(seen, LATER), seen, trackers
 
 
+def with_errors(trackers, plain, seen, stds):
+    """The covariance (9, 9) of an estimate with the errors that are known, the depths' scales with these deviations."""
+    errors = RigErrors(trackers, RIG, stds)
+    return errors.added(plain, errors.views(plain, seen), None, [0.0] * len(RIG)).covariance
+
+
 def check_prediction(model, pictures, depth_weight=None):
     found, seen, trackers = estimated(model, pictures, depth_weight)
     plain = replace(found, covariance=np.zeros((9, 9)))
-    stated = RigErrors(trackers, RIG, [0.0] * len(RIG)).added(plain, seen, None, [0.0] * len(RIG)).covariance
+    stated = with_errors(trackers, plain, seen, [0.0] * len(RIG))
     assert_moved_as_stated(LATER, found.state, stated, trackers[0].estimator.scale)
 
 
@@ -326,9 +332,10 @@ def test_of_two_pictures_each_is_off_in_its_own_way_by_the_same_cause(model, ste
 def test_nothing_is_added_where_nothing_is_known(model):
     found, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
     errors = RigErrors(trackers, RIG)
-    left = errors.unexplained(found, seen)
-    assert max(rest.px for rest in left) < 1e-6
-    stated = errors.added(found, seen, None, [rest.px for rest in left])
+    views = errors.views(found, seen)
+    left = [view.unexplained.px for view in views]
+    assert max(left) < 1e-6
+    stated = errors.added(found, views, None, left)
     np.testing.assert_allclose(stated.covariance, found.covariance, atol=1e-12)
 
 
@@ -342,7 +349,7 @@ def test_the_scale_of_a_depth_camera_moves_the_estimate_of_a_rig_as_predicted(mo
     before, after = estimator.fit(seen, LATER), estimator.fit(RigObservations(tuple(views)), LATER)
     plain, stds = replace(before, covariance=np.zeros((9, 9))), [0.0, 0.0]
     stds[camera] = 0.002
-    stated = RigErrors(trackers, RIG, stds).added(plain, seen, None, [0.0] * len(RIG)).covariance
+    stated = with_errors(trackers, plain, seen, stds)
     assert_moved_as_stated(before.state, after.state, stated, estimator.scale)
 
 
@@ -359,7 +366,7 @@ def test_each_depth_camera_of_a_rig_has_a_scale_of_its_own(model):
         moves = after.camera_from_object.translation - LATER.camera_from_object.translation
         away.append([*(after.parameters - LATER.parameters), *moves])
     plain = replace(before, covariance=np.zeros((9, 9)))
-    stated = RigErrors(trackers, RIG, [0.002, 0.002]).added(plain, seen, None, [0.0] * len(RIG)).covariance
+    stated = with_errors(trackers, plain, seen, [0.002, 0.002])
     rows = np.array([0, 1, 2, 6, 7, 8])
     scatter = np.sqrt(np.mean(np.square(away), axis=0)) / estimator.scale[rows]
     deviations = np.sqrt(np.diag(stated))[rows] / estimator.scale[rows]

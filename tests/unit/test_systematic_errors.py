@@ -463,7 +463,7 @@ def test_the_gradient_of_an_alike_error_and_what_is_left_of_it(case):
     remover = np.eye(len(rows)) - rows @ gain @ weighted.T
     counted = np.kron(pairs * np.outer(used, used), np.eye(2)) > 0
     left = (remover @ both @ remover.T)[counted].mean()
-    assert common.share_left(used, jacobian, gradients, gain) == pytest.approx(left, abs=0.01)
+    assert common.share_left(used, jacobian, gradients, gain, common.n_pairs(used)) == pytest.approx(left, abs=0.01)
 
 
 def test_of_many_points_some_tell_what_all_have_in_common():

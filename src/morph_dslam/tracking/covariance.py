@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
@@ -41,6 +43,14 @@ MOST_COMPARED = 256
 LEAST_LEFT = 0.02
 
 
+@lru_cache(maxsize=64)
+def evenly(count: int, most: int) -> NDArray[np.int64]:
+    """At most ``most`` of ``count`` rows, spread evenly from the first to the last; kept, so not to be changed."""
+    rows = np.linspace(0, count - 1, min(most, count)).astype(np.int64)
+    rows.flags.writeable = False
+    return rows
+
+
 class SharedErrors:
     """How alike errors are in points at these places, and what the same points' residuals show of them.
 
@@ -53,28 +63,35 @@ class SharedErrors:
     def __init__(self, places: Array, window: int) -> None:
         spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
         self.factor = gaussian_factor(places, max(ALIKE_SHARE * spread, 1e-300))
-        self._compared = np.unique(np.linspace(0, len(places) - 1, MOST_COMPARED).astype(np.int64))
+        self._compared = evenly(len(places), MOST_COMPARED)
         # Coordinate by coordinate: sums over a short axis cost numpy most of the time that a view takes.
         apart = [np.abs(column[:, None] - column[None]) for column in places[self._compared].T]
         near = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2 < (PAIR_SHARE * spread) ** 2
         beside = np.maximum(np.maximum(apart[0], apart[1]), apart[2]) >= window
         self._redundancy = _redundancy(apart, window)
-        # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is.
-        self._pairs = (near & beside).astype(np.float64)
-        factor = self.factor[self._compared]
-        self._alike_pairs = (factor @ factor.T) * self._pairs
+        # As numbers, to be multiplied by in every frame; points that do not count are zero in what it is. Sparse: about
+        # one pair in ten is compared.
+        pairs, factor = (near & beside).astype(np.float64), self.factor[self._compared]
+        self._pairs = scipy.sparse.csr_array(pairs)
+        self._alike_pairs = scipy.sparse.csr_array((factor @ factor.T) * pairs)
 
     def n_pairs(self, used: NDArray[np.bool_]) -> float:
         """How many pairs of the points ``used`` (p,) are compared, counted from both sides."""
-        some = used[self._compared]
-        return float(some @ self._pairs @ some)
+        some = used[self._compared].astype(np.float64)
+        return float(some @ (self._pairs @ some))
 
     def in_common(self, rows: Array, n_pairs: float) -> Array:
         """Mean products (k, k), a coordinate, of what pairs of points have in (p, 2, k), zero if unused."""
-        some = rows[self._compared]
-        beside = (self._pairs @ some.reshape(len(some), -1)).reshape(some.shape)
-        found = np.tensordot(some, beside, axes=([0, 1], [0, 1])) / max(2.0 * n_pairs, 1.0)
-        return np.asarray(found, dtype=np.float64)
+        return self._products(rows[self._compared])[0] / max(2.0 * n_pairs, 1.0)
+
+    def _products(self, rows: Array) -> tuple[Array, Array]:
+        """Sums of products (k, k) over the pairs of what the points that are compared have in ``rows`` (q, 2, k).
+
+        With it, of each such point, the sum (q, 2 k) of what those that it is compared with have.
+        """
+        beside = self._pairs @ rows.reshape(len(rows), -1)
+        k = rows.shape[2]
+        return rows.reshape(-1, k).T @ beside.reshape(-1, k), beside
 
     def chance(self, variance: float, n_pairs: float) -> float:
         """Standard deviation of what `in_common` shows where only points whose windows overlap err alike.
@@ -95,7 +112,9 @@ class SharedErrors:
         found = self.factor.T @ weighted_jacobian.reshape(len(weighted_jacobian), -1)
         return np.asarray(found.reshape(-1, n), dtype=np.float64)
 
-    def share_left(self, used: NDArray[np.bool_], jacobian: Array, gradients: Array, gain: Array) -> float:
+    def share_left(
+        self, used: NDArray[np.bool_], jacobian: Array, gradients: Array, gain: Array, n_pairs: float
+    ) -> float:
         """How much of such an error's variance an estimate leaves in the residuals that show it.
 
         With G = J gain J' W what the estimate takes up, it leaves (I - G) K (I - G)' of a covariance K; this
@@ -107,16 +126,16 @@ class SharedErrors:
         jacobian : (p, 2, n), zero if unused
         gradients : (2 r, n) as of `gradients`.
         gain : (n, n) H^-1, or how else the unknowns follow from J' W r.
+        n_pairs : as of `n_pairs`, of the same points.
         """
-        some, jacobian, factor = used[self._compared], jacobian[self._compared], self.factor[self._compared]
-        taken_up = (gradients @ gain.T).reshape(-1, 2, len(gain))
-        spread = (factor @ taken_up.reshape(len(taken_up), -1)).reshape(jacobian.shape)
-        beside = (self._pairs @ jacobian.reshape(len(jacobian), -1)).reshape(jacobian.shape)
-        whole = 2.0 * float(some @ self._alike_pairs @ some)
-        taken = 2.0 * float(np.sum(beside[some] * spread[some]))
-        products = np.tensordot(jacobian, beside, axes=([0, 1], [0, 1]))
-        twice = float(np.sum(products * (gain @ (gradients.T @ gradients) @ gain.T)))
-        return max((whole - taken + twice) / max(2.0 * self.n_pairs(used), 1.0), LEAST_LEFT)
+        some = used[self._compared].astype(np.float64)
+        taken_up, (products, beside) = gradients @ gain.T, self._products(jacobian[self._compared])
+        whole = 2.0 * float(some @ (self._alike_pairs @ some))
+        # Over the points, what is beside them times what is taken up there, by directions of the factor.
+        along = (some[:, None] * self.factor[self._compared]).T @ beside
+        taken = 2.0 * float(along.ravel() @ taken_up.ravel())
+        twice = float(np.sum(products * (taken_up.T @ taken_up)))
+        return max((whole - taken + twice) / max(2.0 * n_pairs, 1.0), LEAST_LEFT)
 
 
 def _redundancy(apart: list[Array], window: int) -> float:

@@ -270,14 +270,15 @@ class RigTracker:
         self, estimate: Estimate, measured: RigObservations, prior: Prior | None
     ) -> tuple[Estimate, list[Unexplained]]:
         """The common estimate with the errors in its covariance, and what it leaves of each camera's residuals."""
-        left = self._errors.unexplained(estimate, measured)
+        views = self._errors.views(estimate, measured)
+        left = [view.unexplained for view in views]
         blurred = [tracker.last_blurred for tracker in self.trackers]
         common = [
             rest.total_px if paths is not None else max(rest.px, tracker.last_doubt_px)
             for tracker, rest, paths in zip(self.trackers, left, blurred, strict=True)
         ]
         known = self.estimator.known_information(estimate.state.parameters)[0]
-        return self._errors.added(estimate, measured, prior, common, blurred, known), left
+        return self._errors.added(estimate, views, prior, common, blurred, known), left
 
     def _found(
         self,

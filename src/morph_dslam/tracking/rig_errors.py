@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class _View:
+class CameraView:
     """What one camera measured, about the common estimate.
 
     Attributes
@@ -44,7 +44,10 @@ class _View:
 
     @property
     def unexplained(self) -> Unexplained:
-        """What the common estimate leaves of the camera's residuals."""
+        """What the common estimate leaves of the camera's residuals.
+
+        It has several causes: the model's error, the rig's calibration, and images that are not of one instant.
+        """
         return self.systematic.unexplained(self.estimate, self.weights > 0.0)
 
 
@@ -81,17 +84,10 @@ class RigErrors:
         self._estimators = [tracker.estimator for tracker in trackers]
         self._depth_stds = [SCALE_STD] * len(cameras) if depth_stds is None else depth_stds
 
-    def unexplained(self, estimate: Estimate, measured: RigObservations) -> list[Unexplained]:
-        """What an estimate, a state in the rig's frame, leaves of the residuals of each camera.
-
-        It has several causes: the model's error, the rig's calibration, and images that are not of one instant.
-        """
-        return [view.unexplained for view in self._views(estimate, measured)]
-
     def added(
         self,
         estimate: Estimate,
-        measured: RigObservations,
+        views: Sequence[CameraView],
         prior: Prior | None,
         common_px: Sequence[float],
         blurred: Sequence[Array | None] | None = None,
@@ -102,14 +98,13 @@ class RigErrors:
         Parameters
         ----------
         estimate : a state in the rig's frame.
-        measured : what it was made from.
+        views : what it was made from, as of `views`.
         prior : what was known of the frame's pose.
-        common_px : by camera, what neighbours have in common in the residuals, as of `unexplained`.
+        common_px : by camera, what neighbours have in common in the residuals, as of `CameraView.unexplained`.
         blurred : by camera (p, 2), the paths over which motion smears the points, pixels; None where it does no harm,
             or for all.
         known : (d + 6, d + 6) what something else that measures parameters adds to the Hessian; None for nothing.
         """
-        views = self._views(estimate, measured)
         frames = [view.systematic.linearized(view.estimate, view.weights) for view in views]
         both = list(zip(views, frames, strict=True))
         hessian = np.sum([view.chain.T @ (frame.hessian + view.of_others) @ view.chain for view, frame in both], axis=0)
@@ -135,7 +130,7 @@ class RigErrors:
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
-    def _moved_by_depths(self, hessian: Array, views: Sequence[_View]) -> Array:
+    def _moved_by_depths(self, hessian: Array, views: Sequence[CameraView]) -> Array:
         """How the scale of each camera's depths moves the estimate (d + 6, k), to either side.
 
         By one deviation, and in squares by what the depths are seen to be off. Steps are finite, with what depths count
@@ -157,7 +152,8 @@ class RigErrors:
                 moved.append(step[:, None] / np.sqrt(2.0))
         return np.concatenate(moved, axis=1)
 
-    def _views(self, estimate: Estimate, measured: RigObservations) -> list[_View]:
+    def views(self, estimate: Estimate, measured: RigObservations) -> list[CameraView]:
+        """What each camera measured, about an estimate, a state in the rig's frame, that was made from it."""
         views, first = [], 0
         for part, chain, systematic, points, estimator, view in zip(
             self._cameras, self._chains, self._systematic, self._points, self._estimators, measured.views, strict=True
@@ -177,6 +173,6 @@ class RigErrors:
             )[1]
             if depths is not None:
                 of_others = of_others + depths.terms(points, seen.state)[1]
-            views.append(_View(chain, systematic, seen, view.weights[:count], depths, of_others))
+            views.append(CameraView(chain, systematic, seen, view.weights[:count], depths, of_others))
             first += len(view.weights)
         return views

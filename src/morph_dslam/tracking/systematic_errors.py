@@ -191,12 +191,12 @@ class SystematicErrors:
         hessian = frame.hessian + others + past + known
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
-        gain = inverse_of_seen(hessian, self._estimator.scale)
+        gain, n_pairs = inverse_of_seen(hessian, self._estimator.scale), self._common.n_pairs(frame.usable)
         covariance, by_reference, self.beyond_reference = estimate.covariance.copy(), self._by_reference, None
         stated = estimate.covariance
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
-            push = self.pushed(frame, estimate.state, depths) + past @ self._by_reference
+            push = self._pushed_by(moved, frame, estimate.state, depths) + past @ self._by_reference
             by_reference = gain @ push
             if self._still and self._factors is not None:
                 # The pose's error moves the points on the surface, and the object with them: both count together.
@@ -206,12 +206,12 @@ class SystematicErrors:
             # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
             if learns and not self._still:
                 left = frame.left(moved, by_reference)
-                self.beyond_reference = self._beyond_reference(frame, left, gain)
-                self._learn_reference(frame, left)
+                self.beyond_reference = self._beyond_reference(frame, left, gain, n_pairs)
+                self._learn_reference(frame, left, n_pairs)
             covariance += self._misfit.factor * by_reference @ by_reference.T
             stated = stated + by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)
-        share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain)
+        share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain, n_pairs)
         by_model = gain @ (common_px / np.sqrt(share) * gradients.T + past @ self._by_model)
         covariance += by_model @ by_model.T
         if blurred is not None:
@@ -224,13 +224,16 @@ class SystematicErrors:
             self._scale.keep(by_scale)
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
-    def _learn_reference(self, frame: Linearization, left: Array) -> None:
-        """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it."""
+    def _learn_reference(self, frame: Linearization, left: Array, n_pairs: float) -> None:
+        """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it.
+
+        ``n_pairs`` is as of `SharedErrors.n_pairs`, of the points that count.
+        """
         both = np.concatenate([frame.residuals[:, :, None], left], axis=2)
-        shown, *expected = np.diag(self._common.in_common(both, self._common.n_pairs(frame.usable)))
+        shown, *expected = np.diag(self._common.in_common(both, n_pairs))
         self._misfit.learn(float(shown), float(sum(expected)))
 
-    def _beyond_reference(self, frame: Linearization, left: Array, gain: Array) -> BeyondReference:
+    def _beyond_reference(self, frame: Linearization, left: Array, gain: Array, n_pairs: float) -> BeyondReference:
         """What a frame shows that no error of the reference explains, errors of any size being fitted.
 
         Parameters
@@ -238,6 +241,7 @@ class SystematicErrors:
         frame : about its estimate, with residuals r = (I - J gain J' W) r0.
         left : L (p, 2, c), what the errors leave of the motions of the pixels: they leave (I - L (L' W L)^-1 L' W) r.
         gain : (n, n) of the estimate.
+        n_pairs : as of `SharedErrors.n_pairs`, of the points that count.
         """
         n, c = len(gain), left.shape[2]
         both, rows = frame.with_unknowns(left), frame.residuals[:, :, None]
@@ -248,11 +252,10 @@ class SystematicErrors:
         taken[:n, :n], taken[n:, n:] = gain, inverse
         taken[n:, :n] = -inverse @ both.products(frame.jacobian)[n:] @ gain
         rest = rows - left @ (inverse @ both.products(rows)[n:])
-        n_pairs = self._common.n_pairs(frame.usable)
         shown, common = np.diag(self._common.in_common(np.concatenate([rows, rest], axis=2), n_pairs))
         noise = max(float(np.sum(rows**2)) / max(2 * int(frame.usable.sum()), 1) - max(float(shown), 0.0), FLOOR_PX**2)
         gradients = self._common.gradients(both.weighted_jacobian)
-        share = self._common.share_left(frame.usable, both.jacobian, gradients, taken)
+        share = self._common.share_left(frame.usable, both.jacobian, gradients, taken, n_pairs)
         return BeyondReference(float(common), self._common.chance(noise, n_pairs), share, noise)
 
     def pushed(self, frame: Linearization, state: State, depths: PointDepths | None = None) -> Array:
@@ -261,7 +264,10 @@ class SystematicErrors:
         With ``depths`` (p,) of the points, also how it enters by these.
         """
         assert self._moved is not None
-        moved = self._warped(state, self._moved)
+        return self._pushed_by(self._warped(state, self._moved), frame, state, depths)
+
+    def _pushed_by(self, moved: Array, frame: Linearization, state: State, depths: PointDepths | None) -> Array:
+        """`pushed`, where the error factors move the pixels by ``moved`` (p, 2, c) in the frame."""
         by_pixels = frame.products(moved)
         return by_pixels if depths is None else by_pixels + self._pushed_by_depths(state, depths, moved)
 
@@ -296,7 +302,8 @@ class SystematicErrors:
         common_px : standard deviation of a pixel coordinate that neighbours have in common in the residuals
         """
         gradients = self._common.gradients(frame.weighted_jacobian @ chain)
-        share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain)
+        n_pairs = self._common.n_pairs(frame.usable)
+        share = self._common.share_left(frame.usable, frame.jacobian @ chain, gradients, gain, n_pairs)
         return np.asarray(gain @ (common_px / np.sqrt(share) * gradients.T), dtype=np.float64)
 
     def pushed_by_blur(self, frame: Linearization, chain: Array, gain: Array, blurred: Array) -> Array:
