@@ -60,6 +60,17 @@ def test_values_and_gradients_are_the_sums_that_define_the_format(form, bases, m
     assert functions.n_functions == 7
 
 
+@every_format
+def test_values_of_many_states_in_any_order_are_their_own_whatever_was_asked_before_and_done_with_it(form):
+    functions, rng = make_functions(form), np.random.default_rng(4)
+    states = rng.uniform(0.0, 1.0, (40, 3))
+    expected = [function_values(functions, mu) for mu in states]
+    for k in [*range(40), *rng.integers(0, 40, 60), *np.repeat(rng.integers(0, 40, 10), 2)]:
+        found = functions.rows(states[k])
+        np.testing.assert_allclose(found[0], expected[k], rtol=1e-10, atol=1e-10)
+        found[:] = np.nan
+
+
 @pytest.mark.parametrize(("precision", "tolerance"), [(np.float64, 1e-13), (np.float32, 1e-6)])
 def test_placed_points_are_moved_turned_and_shifted(precision, tolerance):
     """More numbers than are added up at a time, and modes that are no multiple of four."""

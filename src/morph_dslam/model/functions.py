@@ -23,6 +23,8 @@ from morph_dslam.model.basis_functions import CHEBYSHEV, fill_basis
 from morph_dslam.row_products import row_products
 
 Array = NDArray[np.float64]
+#: So many states' values and derivatives are kept at most: about half of those that a tracked frame asks for.
+KEPT = 16
 
 
 class Functions(ABC):
@@ -59,7 +61,7 @@ class Functions(ABC):
     def rows(self, mu: ArrayLike) -> Array:
         """Values, then the derivative by each parameter (1 + d, n_functions) at ``mu`` (d,), compiled.
 
-        The last ones are kept: fields of the same functions are mostly asked for one after the other.
+        The last ones are kept: fields of the same functions, and steps of a frame, ask for the same state again.
 
         Raises
         ------
@@ -73,13 +75,14 @@ class Functions(ABC):
         known = last.get(key)
         if known is None:
             known = self._compiled(mu)
-            last.clear()
+            if len(last) >= KEPT:
+                last.clear()
             last[key] = known
         return known.copy()
 
     @cached_property
     def _last(self) -> dict[bytes, Array]:
-        """The rows of the last parameters, by their bytes."""
+        """The rows of the last parameters, by their bytes; emptied at once, so that threads need not take turns."""
         return {}
 
     def evaluate(self, mu: ArrayLike) -> tuple[Array, Array]:
