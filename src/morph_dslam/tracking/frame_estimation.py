@@ -65,6 +65,7 @@ class FrameEstimation:
         if self._study_scout is not None:
             self._study_scout.known = estimator.known
         self._last_joined: tuple[BoundPoints, BoundPoints] | None = None
+        self._last_few_and_all: tuple[Measurement, tuple[_Measured, _Measured]] | None = None
 
     @property
     def known(self) -> KnownParameters:
@@ -173,6 +174,7 @@ class FrameEstimation:
             return
         residuals = attempt.estimate.residuals[: len(attempt.inliers)]
         self._noise.learn(attempt.measurement.spread, residuals, attempt.inliers)
+        self._last_few_and_all = None  # the points weigh otherwise now
 
     def left_by_outline(self, attempt: PoseHypothesis) -> Unexplained:
         """What the model leaves of an outline that is alone."""
@@ -283,14 +285,20 @@ class FrameEstimation:
         return self._trimmed(attempt.measurement, other.state, prior)
 
     def _few_and_all(self, attempt: PoseHypothesis) -> tuple[_Measured, _Measured]:
-        """Some of the valid measurements, and all of them, with what they weigh together."""
-        measurement = attempt.measurement
+        """Some of the valid measurements, and all of them, with what they weigh together.
+
+        Mostly those of the last call: several explanations are sought of one frame.
+        """
+        measurement, last = attempt.measurement, self._last_few_and_all
+        if last is not None and last[0] is measurement:
+            return last[1]
         weights, valid = self._noise.weights(measurement.spread, measurement.valid), np.flatnonzero(measurement.valid)
         points, pixels = self._reference.points, measurement.pixels
         rows = valid[:: 1 + len(valid) // SCOUTED]
         # So many times the weight, lest a prior count for more among few.
         few = (points.take(rows), pixels[rows], weights[rows] * (len(valid) / max(len(rows), 1)))
-        return few, (points, pixels, weights)
+        self._last_few_and_all = measurement, (few, (points, pixels, weights))
+        return self._last_few_and_all[1]
 
     def best_of(self, attempt: PoseHypothesis, starts: list[State], share: float = CLEARLY_BETTER) -> PoseHypothesis:
         """The attempt, or what explains its measurements at less than a share of its cost, from one of the starts."""
