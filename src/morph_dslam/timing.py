@@ -20,15 +20,6 @@ class StageClock:
         """Milliseconds since the clock was made."""
         return 1e3 * (perf_counter() - self._start)
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Adds the time that its block takes to the stage's."""
-        start = perf_counter()
-        try:
-            yield
-        finally:
-            self.milliseconds[name] += 1e3 * (perf_counter() - start)
-
 
 _CLOCK: ContextVar[StageClock | None] = ContextVar("frame_clock", default=None)
 
@@ -47,12 +38,12 @@ def frame_clock(names: Sequence[str]) -> Iterator[StageClock]:
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Add the time that the block takes to a stage of the current frame's clock; without a clock do nothing."""
-    clock = _CLOCK.get()
-    if clock is None or name not in clock.milliseconds:
+    clock, start = _CLOCK.get(), perf_counter()
+    try:
         yield
-        return
-    with clock.stage(name):
-        yield
+    finally:
+        if clock is not None and name in clock.milliseconds:
+            clock.milliseconds[name] += 1e3 * (perf_counter() - start)
 
 
 class WaitClock:

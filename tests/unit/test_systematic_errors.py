@@ -14,6 +14,7 @@ from morph_dslam.tracking.covariance import (
     PAIR_SHARE,
     BoundPart,
     SharedErrors,
+    evenly,
     gaussian_factor,
     trace_of_share,
 )
@@ -440,6 +441,16 @@ def case():
     jacobian = np.where(used[:, None, None], rng.standard_normal((90, 2, 4)) + 1.0, 0.0)
     scores = rng.uniform(0.5, 2.0, (90, 1, 1)) * jacobian
     return points, used, jacobian, scores
+
+
+@pytest.mark.parametrize(("count", "most"), [(348, 256), (7, 7), (100, 2), (3, 10), (1, 5), (0, 5)])
+def test_rows_are_spread_evenly_from_the_first_to_the_last(count, most):
+    found, fewer = evenly(count, most), min(count, most)
+    assert len(found) == fewer
+    if fewer:
+        assert (found[0], found[-1]) == (0, count - 1 if fewer > 1 else 0)
+        np.testing.assert_allclose(found, np.arange(fewer) * (count - 1) / max(fewer - 1, 1), atol=1.0)
+        assert (np.diff(found) > 0).all()
 
 
 def test_what_pairs_have_in_common_is_the_mean_over_them(case):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.row_products import FAST
+from morph_dslam.tracking.covariance import evenly
 
 Array = NDArray[np.float64]
 #: Places, as many as there may be, and how far the points of one reach, as a share of the object's diagonal.
@@ -141,7 +142,7 @@ class JumpDetector:
     def _like(self, away: Array) -> NDArray[np.int64]:
         """Which earlier frames (f,) have nearly this shape, by how far ``away`` (h,) theirs are."""
         rows = np.flatnonzero((away > LIKE[0] * self._largest) & (away < LIKE[1] * self._largest))
-        return rows[np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).astype(int))]
+        return rows[evenly(len(rows), COMPARED)]
 
     def _note(self, sizes: Array, least: float) -> None:
         """Note the places at which steps have grown (k,) by ``least``."""

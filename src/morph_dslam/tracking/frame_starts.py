@@ -174,9 +174,10 @@ class FrameGaps:
         if last is None:
             return False
         interval = timestamp - last
-        is_gap = bool(self._intervals) and interval > max(GAP_S, GAP_INTERVALS * float(np.median(self._intervals)))
+        # The median is hardly ever asked for.
+        is_gap = interval > GAP_S and bool(self._intervals) and interval > GAP_INTERVALS * np.median(self._intervals)
         self._intervals.append(interval)
-        return is_gap
+        return bool(is_gap)
 
     def n_missing(self, number: int | None) -> int:
         """How many frames there were between the last one and the next one, of this number: lost, or dropped live.

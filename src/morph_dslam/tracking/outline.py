@@ -233,10 +233,10 @@ class Outline:
         shown, turns_away = places + drift, self._contour.turns_away
         offsets = np.asarray(search_outline(grey, shown, normals_there, turns_away, self._beside, reach))
         found = np.zeros(N_POINTS)
-        found[slots] = np.isfinite(offsets)
+        found[slots] = is_found = np.isfinite(offsets)
         pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))
         normals[:, 0] = 1.0  # of points that are not there; they count as ones of an outline all the same
-        pixels[slots] = places + np.nan_to_num(offsets)[:, None] * normals_there
+        pixels[slots] = places + np.where(is_found, offsets, 0.0)[:, None] * normals_there
         normals[slots] = normals_there
         return OutlineMeasurement(self.points, pixels, normals, self._used, found)
 

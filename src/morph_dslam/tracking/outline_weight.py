@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.covariance import LEAST_SPREAD_PX as LEAST_NOISE_PX
+from morph_dslam.tracking.covariance import evenly
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.outline import OutlineMeasurement
 
@@ -71,7 +72,7 @@ class ErrorComponent:
         """
         if len(pixels) < LEAST_POINTS or not np.isfinite(variance):
             return
-        compared = np.unique(np.linspace(0, len(pixels) - 1, MOST_COMPARED).astype(np.int64))
+        compared = evenly(len(pixels), MOST_COMPARED)
         some = pixels[compared]
         alike, apart = near_products(some, residuals[compared], NEAR_PX)
         alike /= max(float(np.mean(residuals**2)), 1e-300)

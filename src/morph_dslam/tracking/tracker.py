@@ -22,6 +22,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring, CameraLocalization
 from morph_dslam.tracking.compilation import announce_compilation
+from morph_dslam.tracking.covariance import evenly
 from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
@@ -285,7 +286,7 @@ class Tracker:
         with stage("flow"):
             rows = np.flatnonzero(self._supported)
             count = min(max(FOLLOWED_A_UNKNOWN * len(self.estimator.scale), LEAST_FOLLOWED), MOST_FOLLOWED, len(rows))
-            rows = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+            rows = rows[evenly(len(rows), count)]
             last = self.reference.projected(self._last)
             guesses = self._pixels + self._expected_motion(last, prior)
             # Half of the size is exact enough for a start.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from morph_dslam.tracking.patches import FLOW_WINDOW
+from morph_dslam.tracking.patches import FLOW_WINDOW, zero_where_unknown
 
 Array = NDArray[np.float64]
 #: Points about each one.
@@ -43,4 +43,4 @@ class WindowMeans:
         """
         about = np.einsum("pk,pkc->pc", self._weights, motions[self._rows])
         shares = np.minimum(FLOW_WINDOW**2 / (6.0 * pixels_per_metre**2 * self._squared), 1.0)
-        return np.nan_to_num(shares[:, None] * (about - motions))
+        return zero_where_unknown(shares[:, None] * (about - motions))
