@@ -13,8 +13,7 @@ import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.tracking.covariance import LEAST_SPREAD_PX as LEAST_NOISE_PX
-from morph_dslam.tracking.covariance import evenly
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX as LEAST_NOISE_PX, evenly
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.outline import OutlineMeasurement
 
