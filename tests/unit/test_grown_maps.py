@@ -10,7 +10,8 @@ from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.registration.register import register
-from morph_dslam.registration.registration import KeyframePose, MapRegistration, load_registration, registration_in_map
+from morph_dslam.registration.registration import KeyframePose, MapRegistration, registration_in_map
+from morph_dslam.registration.registration_file import load_registration
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.local_map import correct_map
 from morph_dslam.slam.map_files import map_from_colmap

@@ -80,7 +80,7 @@ class FrameLog:
                 f"{first.path} to be replaced (`--overwrite`)"
             )
         self._is_begun = False
-        with writing(TrackingError, path), path.open("a"):  # what is wrong with it is said at once
+        with writing(TrackingError, path), path.open("a", encoding="utf-8"):  # what is wrong with it is said at once
             pass
 
     def start_again(self) -> None:
