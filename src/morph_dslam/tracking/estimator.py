@@ -24,7 +24,7 @@ from morph_dslam.tracking.levenberg_marquardt import Box, Minimum, minimise
 from morph_dslam.tracking.load_prior import LoadOptions, LoadPrior
 from morph_dslam.tracking.noise import Correlation, Observations, quadratic
 from morph_dslam.tracking.option_values import CheckedOptions, NotNegative, Positive, PositiveCount
-from morph_dslam.tracking.reprojection import linearise, weighted_derivatives
+from morph_dslam.tracking.reprojection import linearise, project_with_jacobian, weighted_derivatives
 from morph_dslam.tracking.state import BoundPoints, Prior, State, moved
 
 Array = NDArray[np.float64]
@@ -301,6 +301,14 @@ class Estimator:
         """What `evaluate` gives of the pixels alone."""
         seen = pixels, weights, normals, self.options.huber_px
         return linearise(*points.in_state(state), self.camera.intrinsics, *seen)
+
+    def jacobian(self, points: BoundPoints, state: State) -> Array:
+        """Derivatives (p, 2, d + 6) of the points' pixels at a state; NaN behind the camera."""
+        pose = state.camera_from_object
+        return project_with_jacobian(
+            points.field.functions.rows(state.parameters), pose.rotation, pose.translation,
+            points.rest, points.field.modes, self.camera.intrinsics,
+        )[1]  # fmt: skip
 
     def within(self, box: Box) -> Self:
         """The same, whose parameters stay in another box."""

@@ -17,19 +17,22 @@ from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_starts import ShapeSearch
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
 from morph_dslam.tracking.known_values import LEAST_SIGMA_PX, KnownParameters
+from morph_dslam.tracking.levenberg_marquardt import Minimum
 from morph_dslam.tracking.measurement import PATCH_WINDOW, Followed, Measurement
 from morph_dslam.tracking.motion_blur import ReferenceBlur, blurred_paths, path_length
 from morph_dslam.tracking.noise import Correlation, Observations, PointNoise, block_diagonal, middle, window_correlation
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.other_tilt import LIKELIER, find_other_tilt
 from morph_dslam.tracking.outcomes import DepthNotUsed
-from morph_dslam.tracking.outline import REACH_PX, OutlineMeasurement, n_absent
+from morph_dslam.tracking.outline import REACH_PX, Outline, OutlineMeasurement, n_absent
 from morph_dslam.tracking.outline_weight import OutlineBalance, beside_found, mean_square
 from morph_dslam.tracking.patches import zero_where_unknown
 from morph_dslam.tracking.reference import ReferenceView
+from morph_dslam.tracking.reference_correction import CorrectionCheck, reference_correction
 from morph_dslam.tracking.reference_misfit import Unexplained
 from morph_dslam.tracking.row_motion import RowMotion
 from morph_dslam.tracking.state import BoundPoints
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 
 Array = NDArray[np.float64]
 _Measured = tuple[BoundPoints, Array, Array]
@@ -44,6 +47,8 @@ SCOUTED = 80
 #: A shape is measured again where what windows miss of its change is more than this share of the noise of all points
 #: together, a standard deviation of whatever they tell best; at most so often.
 MISSED_SHARE, MOST_COMPARISONS = 0.5, 2
+#: In the first frame with an outline its noise is learnt anew so often: each time the estimate is nearer to it.
+FIRST_ROUNDS = 3
 #: Depths this many times as far as the points have the object are in another unit, or of another camera.
 MOST_TIMES = 1.5
 
@@ -54,7 +59,7 @@ class FrameEstimation:
     def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
         self._estimator, self._reference, self._options = estimator, reference, options
         self._noise, self._balance = PointNoise(), OutlineBalance()
-        self._reference_blur = ReferenceBlur()
+        self._reference_blur, self._correction_check = ReferenceBlur(), CorrectionCheck()
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
@@ -228,7 +233,8 @@ class FrameEstimation:
         """
         if attempt.other_tilt is None or attempt.prior is not None:
             return replace(attempt, other_tilt=None)
-        measured = self.measured(attempt, correlated=False)
+        # The reference's error was found for the one tilt: either is asked without it.
+        measured = self.measured(replace(attempt, correction=None), correlated=False)
         n_numbers = int(measured.numbers[measured.weights > 0.0].sum())
         other = find_other_tilt(
             lambda start: self._scout.fitted(measured, start),
@@ -236,7 +242,7 @@ class FrameEstimation:
         )  # fmt: skip
         if other.ratio < -(LIKELIER**2):
             taken, other = other.state, other.left(attempt.estimate.state)
-            attempt = replace(attempt, estimate=self._estimator.fit(measured, taken))
+            attempt = replace(attempt, estimate=self._estimator.fit(measured, taken), correction=None)
         return replace(attempt, other_tilt=None if other.is_excluded else other)
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
@@ -315,35 +321,91 @@ class FrameEstimation:
     def _cost(self, measured: _Measured, state: State, prior: Prior | None) -> float:
         return self._estimator.evaluate(*measured, state, prior=prior)[0]
 
-    def fit_outline(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
-        """Estimate from the supporting points and the outline together; searched far first, then near."""
-        outline = self._reference.outline
+    def fit_outline(
+        self, picture: Image, attempt: PoseHypothesis, systematic: SystematicErrors | None = None
+    ) -> PoseHypothesis:
+        """Estimate from the supporting points and the outline together.
+
+        ``systematic`` : of the points; the outline then also tells of the error that the reference has given them,
+        unless the frames so far have shown that something else sets both apart.
+        """
+        outline, check = self._reference.outline, self._correction_check
         if outline is None or attempt.outline_alone:
             return attempt
+        # A pose that is held has the registration's error, too: together with the points' it leaves the shape as it is.
+        if self._options.pose == "fixed" or (systematic is not None and not systematic.knows_reference):
+            systematic = None
+        if systematic is None or check.is_refuted:
+            return self._beside(outline, picture, attempt)
+        found, rows = self._beside(outline, picture, attempt, systematic), attempt.inliers
+        if found.correction is not None:
+            alone, beside = [one.estimate.residuals[: len(rows)][rows] for one in (attempt, found)]
+            shift, weights, n_unknowns = found.correction.shift[rows], attempt.weights[rows], len(self._estimator.scale)
+            check.learn(alone, beside, shift, weights, self._reference.redundancy, n_unknowns)
+        if check.is_refuted:
+            self._balance = OutlineBalance()  # which was learnt with the correction
+            found = self._beside(outline, picture, attempt)
+        return found
+
+    def _beside(
+        self, outline: Outline, picture: Image, attempt: PoseHypothesis, systematic: SystematicErrors | None = None
+    ) -> PoseHypothesis:
+        """As `fit_outline`; the outline is searched for far first, then near."""
         estimate, balance = attempt.estimate, self._balance
         if picture.has_grey and not outline.knows_brightness:
             outline.take_brightness(picture.grey, estimate.state)
         drawing, occluders = attempt.measurement.drawing, picture.occluder_depth
         seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing, picture.motion)
         seen = self._uncovered(seen, attempt, estimate.state)
-        if balance.weight == 0.0:
+        is_first = balance.weight == 0.0
+        anew = is_first and systematic is not None and balance.suppose_exact_outline(seen)
+        if is_first:
             balance.learn_texture(*self._supporting(attempt, estimate))
+        if is_first and not anew:
             offsets = self._estimator.camera.project(seen.points.in_camera(estimate.state)) - seen.pixels
             balance.learn_outline(seen, offsets, 0.0)
         # After the first search the state only says where to look the second time: it need not be exact.
-        wide = self._with_outline(attempt, seen.weighted(balance.weight))
-        state = self._scout.fitted(wide, estimate.state, attempt.prior).state
-        seen = outline.measure_again(picture.grey, state, REACH_PX // 2, occluders, picture.motion)
-        seen = self._uncovered(seen, attempt, state).weighted(balance.weight)
-        together = self._with_outline(attempt, seen)
-        found = self._estimator.fitted(together, state, attempt.prior)
-        estimate = self._estimator.finished(found, together.weights, together.numbers)
-        of_outline = estimate.residuals[-len(seen.weights) :]
-        agreeing = seen.weighted(balance.weight, balance.agreeing(of_outline))
-        balance.learn_outline(seen, of_outline, self._taken(seen, found.state, found.hessian))
-        balance.learn_texture(*self._supporting(attempt, estimate))
-        estimate = self._estimator.fit(self._with_outline(attempt, agreeing), found.state, attempt.prior)
-        return replace(attempt, estimate=estimate, outline=agreeing)
+        attempt = replace(attempt, outline=seen.weighted(balance.weight))
+        attempt, found = self._corrected(attempt, estimate.state, systematic, self._scout)
+        seen = outline.measure_again(picture.grey, found.state, REACH_PX // 2, occluders, picture.motion)
+        seen = self._uncovered(seen, attempt, found.state)
+        for _ in range(FIRST_ROUNDS if anew else 1):
+            seen = seen.weighted(balance.weight)
+            attempt, found = self._corrected(replace(attempt, outline=seen), found.state, systematic, self._estimator)
+            of_outline = found.residuals[-len(seen.weights) :]
+            agreeing = seen.weighted(balance.weight, balance.agreeing(of_outline))
+            taken = self._taken(seen, found.state, self._told(attempt, found))
+            balance.learn_outline(seen, of_outline, taken, anew)
+        balance.learn_texture(*self._supporting(attempt, self._finished(attempt, found)))
+        attempt, found = self._corrected(replace(attempt, outline=agreeing), found.state, systematic, self._estimator)
+        return replace(attempt, estimate=self._finished(attempt, found))
+
+    def _finished(self, attempt: PoseHypothesis, found: Minimum) -> Estimate:
+        """The estimate at a minimum of the points' and the outline's cost."""
+        together = self._with_outline(attempt)
+        return self._estimator.finished(found, together.weights, together.numbers)
+
+    def _corrected(
+        self, attempt: PoseHypothesis, start: State, systematic: SystematicErrors | None, estimator: Estimator
+    ) -> tuple[PoseHypothesis, Minimum]:
+        """The attempt with what its outline tells of the reference's error, and the minimum then."""
+        found = estimator.fitted(self._with_outline(attempt), start, attempt.prior)
+        texture, rows = self._balance.texture, slice(len(attempt.inliers))
+        if systematic is None or attempt.outline is None or not attempt.outline.valid.any():
+            return attempt, found
+        pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights)
+        if pushed is None or np.isnan(texture.variance):
+            return attempt, found
+        correction = reference_correction(
+            self._estimator, self._with_outline(attempt), found, attempt.prior, pushed, texture.independent,
+            attempt.correction,
+        )  # fmt: skip
+        attempt = replace(attempt, correction=correction)
+        return attempt, estimator.fitted(self._with_outline(attempt), found.state, attempt.prior)
+
+    def _told(self, attempt: PoseHypothesis, found: Minimum) -> Array:
+        """The Hessian (d + 6, d + 6) at a minimum, less what the points do not tell as the reference is off."""
+        return found.hessian if attempt.correction is None else found.hessian - attempt.correction.untold
 
     def _uncovered(self, seen: OutlineMeasurement, attempt: PoseHypothesis, state: State) -> OutlineMeasurement:
         """The outline without what lies beside texture that should be seen and was not found.
@@ -401,9 +463,9 @@ class FrameEstimation:
         residuals = estimate.residuals[: len(rows)][rows]
         return attempt.measurement.pixels[rows], residuals, mean_square(residuals, attempt.weights[rows], n_unknowns)
 
-    def _with_outline(self, attempt: PoseHypothesis, seen: OutlineMeasurement) -> Observations:
+    def _with_outline(self, attempt: PoseHypothesis) -> Observations:
         """The supporting points and the outline together."""
-        return self.measured(replace(attempt, outline=seen, depths=None), correlated=False)
+        return self.measured(replace(attempt, depths=None), correlated=False)
 
     def _taken(self, seen: OutlineMeasurement, state: State, hessian: Array) -> float:
         """How many of the outline's numbers an estimate takes up: the trace of H^-1 H_outline.
@@ -468,6 +530,8 @@ class FrameEstimation:
         ``correlated`` : whether their errors' correlation is wanted; it takes time.
         """
         points, pixels, weights = self._reference.points, attempt.measurement.pixels, attempt.weights
+        if attempt.correction is not None:
+            pixels = pixels - attempt.correction.shift
         normals, seen = np.zeros_like(pixels), attempt.outline
         correlation: Correlation = np.zeros((0, 0))
         if correlated:

@@ -19,6 +19,7 @@ from morph_dslam.tracking.other_tilt import OtherTilt
 from morph_dslam.tracking.outcomes import DepthNotUsed, Rejection, RejectionReason
 from morph_dslam.tracking.outline import OutlineMeasurement
 from morph_dslam.tracking.outline_weight import MEDIAN_OF_NUMBER
+from morph_dslam.tracking.reference_correction import ReferenceCorrection
 from morph_dslam.tracking.row_motion import RowMotion
 from morph_dslam.tracking.state import State
 
@@ -76,6 +77,7 @@ class PoseHypothesis:
     weights : (p,) that the measurements counted with, zero for those that do not support the estimate.
     prior : what was known of the pose from the map; None if nothing was.
     outline : of the object's rim, where it counts.
+    correction : what the outline tells of the reference's error; None where it does not.
     depths : of the points that support it, where a depth camera saw them.
     depth_unused : why there are none, where they are asked for.
     discrepancy : what the shape has beyond the model's, once it was estimated.
@@ -95,6 +97,7 @@ class PoseHypothesis:
     weights: Array
     prior: Prior | None = None
     outline: OutlineMeasurement | None = None
+    correction: ReferenceCorrection | None = None
     depths: PointDepths | None = None
     depth_unused: DepthNotUsed | None = None
     discrepancy: Discrepancy | None = None

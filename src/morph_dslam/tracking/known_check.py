@@ -48,6 +48,7 @@ def refuted_values(
     if not len(known.indices):
         return []
     rows, (values, deviations) = known.indices, known.now.T
+    hypothesis = replace(hypothesis, correction=None)  # which was found with the sensors' help
     with known.set_aside():
         alone = estimation.fitted(hypothesis)
         common_px = max(systematic.unexplained(alone, hypothesis.inliers).px, doubt_px)

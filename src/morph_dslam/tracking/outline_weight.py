@@ -3,7 +3,8 @@
 The errors of either have a variance, and are alike in neighbours. Both are learnt from the frames as components of one
 fit (Rao, J. Multivariate Analysis 1, 257, 1971): residuals are larger than they seem by what the estimate has taken
 up of them. The ratio of what one independent number of each is worth is the outline's weight. Clutter that it is
-mistaken for thus lowers its weight, and texture that agrees badly with the model raises it.
+mistaken for thus lowers its weight, and texture that agrees badly with the model raises it. What the texture's points
+have in common because the reference state is off is no noise of either: `reference_correction` takes it out.
 """
 
 from __future__ import annotations
@@ -60,6 +61,15 @@ class ErrorComponent:
         self.variance, self.redundancy = np.nan, 1.0
         self._alike, self._apart = float(np.exp(-NEAR_PX / FIRST_LENGTH_PX)), NEAR_PX
 
+    def suppose(self, pixels: Array, variance: float) -> None:
+        """Begin with a variance of a number, and errors that are alike as they are before any frame has shown it.
+
+        ``pixels`` (p, 2) are those of the points.
+        """
+        compared = np.unique(np.linspace(0, len(pixels) - 1, MOST_COMPARED).astype(np.int64))
+        alike = float(mean_correlation(pixels[compared], FIRST_LENGTH_PX))
+        self.variance, self.redundancy = variance, 1.0 + (len(pixels) - 1) * alike
+
     def learn(self, pixels: Array, residuals: Array, variance: float) -> None:
         """Take in a frame.
 
@@ -81,6 +91,11 @@ class ErrorComponent:
         self._apart += rate * (apart - self._apart)
         count = 1.0 + (len(pixels) - 1) * float(mean_correlation(some, self.length))
         self.redundancy += rate * (count - self.redundancy)
+
+    @property
+    def independent(self) -> float:
+        """Variance of a number times how many points count as one: what one independent number is worth."""
+        return self.redundancy * self.variance
 
     @property
     def length(self) -> float:
@@ -105,12 +120,23 @@ class OutlineBalance:
         if np.isnan(self.texture.variance) or np.isnan(self.outline.variance):
             return 0.0
         ours = self.outline.redundancy * max(self.outline.variance, LEAST_SPREAD_PX**2)
-        return self.texture.redundancy * self.texture.variance / ours
+        return self.texture.independent / ours
 
     def correlation(self, seen: OutlineMeasurement) -> scipy.sparse.csr_array:
         """Of the errors (p, p) of the outline's points; those that do not count have none in common."""
         count = len(seen.pixels)
         return scipy.sparse.csr_array(_alike(seen.pixels, seen.valid, self.outline.length), shape=(count, count))
+
+    def suppose_exact_outline(self, seen: OutlineMeasurement) -> bool:
+        """Begin with an outline as exact as one can be, if enough points can tell then how exact it is.
+
+        In the state that a wrong registration gives, residuals tell of that alone.
+        """
+        if seen.valid.sum() < LEAST_POINTS:
+            return False
+        self.outline = ErrorComponent()
+        self.outline.suppose(seen.pixels[seen.valid], LEAST_SPREAD_PX**2)
+        return True
 
     def agreeing(self, residuals: Array) -> NDArray[np.bool_]:
         """Which of the outline's points (p,) agree with an estimate that leaves these residuals (p, 2)."""
@@ -137,8 +163,16 @@ class OutlineBalance:
         across = np.einsum("pk,pk->p", residuals, seen.normals)[seen.valid]
         return float(np.sqrt(max(near_products(seen.pixels[seen.valid], across[:, None], NEAR_PX)[0], 0.0)))
 
-    def learn_outline(self, seen: OutlineMeasurement, residuals: Array, taken: float) -> None:
-        """Take in the residuals (p, 2) of the outline; ``taken`` is how many numbers the estimate takes up."""
+    def learn_outline(self, seen: OutlineMeasurement, residuals: Array, taken: float, anew: bool = False) -> None:
+        """Take in the residuals (p, 2) of the outline.
+
+        Parameters
+        ----------
+        taken : how many numbers the estimate takes up.
+        anew : whether to forget what was learnt or supposed before.
+        """
+        if anew:
+            self.outline = ErrorComponent()
         used = seen.valid
         across = np.einsum("pk,pk->p", residuals, seen.normals)[used]
         if not len(across):

@@ -36,6 +36,7 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
+from morph_dslam.tracking.reference_correction import PushedTexture, ReferenceCorrection
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, BeyondReference, ReferenceMisfit, Unexplained
 from morph_dslam.tracking.reprojection import project_with_jacobian
 
@@ -165,6 +166,7 @@ class SystematicErrors:
         blurred: Array | None = None,
         depths: PointDepths | None = None,
         of_outline: Array | None = None,
+        corrected: ReferenceCorrection | None = None,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
 
@@ -181,6 +183,7 @@ class SystematicErrors:
         blurred : (p, 2) pixels, the paths over which motion smears the points; None where it does no harm.
         depths : (p,) of the points, where a depth camera saw them; None without one.
         of_outline : (d + 6, d + 6) the Hessian of an outline beside the points; None without one.
+        corrected : what of the reference's error the points were corrected by; None where they were not.
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
@@ -196,7 +199,9 @@ class SystematicErrors:
         stated = estimate.covariance
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
-            push = self._pushed_by(moved, frame, estimate.state, depths) + past @ self._by_reference
+            push = self._pushed_by(moved, frame, estimate.state, depths)
+            push = push if corrected is None else push @ corrected.left
+            push = push + past @ self._by_reference
             by_reference = gain @ push
             if self._still and self._factors is not None:
                 # The pose's error moves the points on the surface, and the object with them: both count together.
@@ -205,7 +210,8 @@ class SystematicErrors:
                 by_reference[d:] = self._factors[d:]
             # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
             if learns and not self._still:
-                left = frame.left(moved, by_reference)
+                # The correction is along what the points alone take for motion: what they leave is the same.
+                left = frame.left(moved, by_reference if corrected is None else corrected.transfer)
                 self.beyond_reference = self._beyond_reference(frame, left, gain, n_pairs)
                 self._learn_reference(frame, left, n_pairs)
             covariance += self._misfit.factor * by_reference @ by_reference.T
@@ -290,6 +296,28 @@ class SystematicErrors:
         for k, column in enumerate(along.T):
             push[:, k] = (replace(depths, depths=at - STEP * column).terms(self._points, state)[2] - gradient) / STEP
         return push
+
+    @property
+    def knows_reference(self) -> bool:
+        """Whether the reference's error is known, and none of the pose that holds in all frames."""
+        return self._moved is not None and not self._still
+
+    def pushed_texture(self, state: State, residuals: Array, weights: Array) -> PushedTexture | None:
+        """The points in a frame, and how these alone take the reference's error for motion.
+
+        None where nobody knows that error, or where it is the same for the object's pose itself.
+
+        Parameters
+        ----------
+        state : of the frame, to linearise about.
+        residuals : (p, 2) that it leaves of the points, pixels.
+        weights : (p,) of these.
+        """
+        if not self.knows_reference:
+            return None
+        frame = Linearization.of(self._project(state)[1], residuals, weights, self._estimator.options.huber_px)
+        transfer = inverse_of_seen(frame.hessian, self._estimator.scale) @ self.pushed(frame, state)
+        return PushedTexture(frame, transfer)
 
     def pushed_by_model(self, frame: Linearization, chain: Array, gain: Array, common_px: float) -> Array:
         """How an estimate from several cameras moves (n, c) by what the model is off in this one.

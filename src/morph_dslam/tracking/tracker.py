@@ -364,7 +364,7 @@ class Tracker:
         with stage("search"):  # of one that was found otherwise than by `_search`, too
             hypothesis = estimation.in_likelier_tilt(hypothesis)
         with stage("outline"):
-            hypothesis = estimation.fit_outline(image, hypothesis)
+            hypothesis = estimation.fit_outline(image, hypothesis, self._view.systematic)
         with stage("depth"):
             hypothesis = estimation.fit_depths(image, hypothesis)
         with stage("search"):

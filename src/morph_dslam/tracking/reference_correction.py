@@ -1,0 +1,200 @@
+"""What an outline tells of the reference state's error, which the texture's points in a frame have in common.
+
+The points were bound to the mesh by the reference state. Where that is off by its error factors z, each of variance
+one, the points alone have the object off by G z = H_t^-1 J' W M J0 F z (`systematic_errors`). Its outline refers to no
+other image and has no part in this. Fitted together as if the texture had no such error, a registration by clicks would
+outweigh any outline, and what the outline is then off by would pass for its noise. So z is one more unknown, with what
+the registration states of it as a prior: the texture's residuals are J x + J G z, and what the points do not take for
+motion of the object stays out of it, because the model's own errors look alike. The pixels of the points are corrected
+by J G z, and of the reference's error that is left which neither outline nor registration tells.
+
+The prior is what the registration states, and not more by what frames seem to show: a model that is off would widen it.
+Texture and outline disagree by the model's error, too, where it cannot take the object's shape. That is none that z
+makes good: an outline that counts then pulls the points from where they fit. `CorrectionCheck` looks whether it does.
+
+An outline may err as a whole: light from one side moves the edges on that side, and a rounded edge all of them. So it
+tells nothing that a shift of all of it, or one outwards, of `COMMON_PX` would explain: two more unknowns and a third.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from morph_dslam.tracking.estimator import Estimator
+from morph_dslam.tracking.levenberg_marquardt import Minimum
+from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
+from morph_dslam.tracking.noise import Observations
+from morph_dslam.tracking.outline_weight import mean_square
+from morph_dslam.tracking.reference_misfit import FLOOR_PX, REFUTED
+from morph_dslam.tracking.state import Prior
+
+Array = NDArray[np.float64]
+#: Standard deviation of what an outline may be off by as a whole in each direction, and outwards, pixels.
+COMMON_PX = 0.1
+#: A correction, which is to first order, may be off by this share of itself.
+SECOND_ORDER = 0.1
+#: Probability that a Gaussian number is farther off than `REFUTED` deviations.
+CHANCE = 2.0 * float(scipy.special.ndtr(-REFUTED))
+
+
+@dataclass(frozen=True)
+class PushedTexture:
+    """The texture's points in a frame, and how they take the reference's error for motion.
+
+    Attributes
+    ----------
+    frame : the points about the state
+    transfer : (d + 6, c), G: how the points alone have the object off by each error factor.
+    """
+
+    frame: Linearization
+    transfer: Array
+
+
+@dataclass(frozen=True)
+class ReferenceCorrection:
+    """The reference's error as a frame has it.
+
+    Attributes
+    ----------
+    found : (c,) of the error factors, in the deviations that were stated of them.
+    shift : (p, 2) pixels, by which it moves the texture's points in the frame.
+    transfer : (d + 6, c) as of `PushedTexture`.
+    left : (c, c), a symmetric root of the covariance that is left of them, the stated one being the identity.
+    untold : (d + 6, d + 6) of the points' Hessian, what they do not tell of the object as the reference is off.
+    """
+
+    found: Array
+    shift: Array
+    transfer: Array
+    left: Array
+    untold: Array
+
+
+class CorrectionCheck:
+    """Whether texture and outline disagree by the reference's error, as the frames of a sequence show it.
+
+    If it is, the points fit beside the outline as well as alone, once they are corrected. The sum of their squares then
+    rises by what the state may be off by their noise, chi-squared of as many numbers as there are unknowns, and by what
+    the correction lacks of second order. A rise that is as unlikely as `REFUTED` deviations is another error's: the
+    model's, or clutter's that the outline was mistaken for. The registration's error is the same in all frames and
+    clutter passes. So the frames vote, and the correction is given up for good as soon as most are against it.
+
+    Attributes
+    ----------
+    is_refuted : whether something else sets texture and outline apart.
+    """
+
+    def __init__(self) -> None:
+        self.is_refuted, self._ahead = False, 0
+
+    def learn(
+        self, alone: Array, beside: Array, shift: Array, weights: Array, redundancy: float, n_unknowns: int
+    ) -> None:
+        """Take in a frame.
+
+        Parameters
+        ----------
+        alone : (p, 2) residuals of the points by themselves, pixels.
+        beside : (p, 2) of the corrected points beside the outline.
+        shift : (p, 2) pixels, by which they were corrected.
+        weights : (p,) of the points.
+        redundancy : how many of the points count as one, because their windows overlap.
+        n_unknowns : of the state.
+        """
+        # Where a picture is compared with itself, nearly nothing is left.
+        noise = max(mean_square(alone, weights, n_unknowns), FLOOR_PX**2)
+        squares = beside**2 - alone**2 - (SECOND_ORDER * shift) ** 2
+        rise = float(weights @ np.sum(squares, axis=1)) / (redundancy * noise)
+        self._ahead += 1 if rise < float(scipy.special.chdtri(n_unknowns, CHANCE)) else -1
+        self.is_refuted = self.is_refuted or self._ahead < 0
+
+
+def reference_correction(
+    estimator: Estimator,
+    together: Observations,
+    found: Minimum,
+    prior: Prior | None,
+    texture: PushedTexture,
+    squared_px: float,
+    before: ReferenceCorrection | None,
+) -> ReferenceCorrection:
+    """The reference's error about the minimum of a frame's cost, to first order.
+
+    Parameters
+    ----------
+    estimator : whose cost it is.
+    together : the texture's points, corrected by what was found before, and then the outline's.
+    found : the minimum.
+    prior : what is known of the frame's pose.
+    texture : the points about the minimum.
+    squared_px : variance of a number of weight one, times how many points of the texture count as one.
+    before : the correction so far; None for the first one.
+    """
+    count, state = len(texture.frame.usable), found.state
+    _, hessian, gradient, residuals = estimator.evaluate(
+        together.points, together.pixels, together.weights, state, together.normals, prior
+    )
+    jacobian, outline = estimator.jacobian(together.points, state)[count:], slice(count, None)
+    across = np.einsum("pkn,pk->pn", jacobian, together.normals[outline])
+    off = np.einsum("pk,pk->p", residuals[outline], together.normals[outline])
+    huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.abs(off), 1e-300))
+    weights = np.where(np.isfinite(off), together.weights[outline] * huber, 0.0)
+    used = weights > 0.0
+    common = of_common_errors(across[used], off[used], weights[used], together.normals[outline][used], squared_px)
+    so_far = np.zeros(texture.transfer.shape[1]) if before is None else before.found
+    return corrected(texture, (hessian - common[0], gradient - common[1]), squared_px, estimator.scale, so_far)
+
+
+def of_common_errors(
+    across: Array, off: Array, weights: Array, normals: Array, squared_px: float
+) -> tuple[Array, Array]:
+    """What errors of a whole outline take away from the Hessian (n, n) and the gradient (n,) of its points.
+
+    Parameters
+    ----------
+    across : (k, n) derivatives of its points' pixels along their normals.
+    off : (k,) residuals along these, pixels.
+    weights : (k,).
+    normals : (k, 2) outwards.
+    squared_px : variance of a number of weight one.
+    """
+    common = np.column_stack([np.ones(len(normals)), normals])
+    weighted = weights[:, None] * common
+    inverse = np.linalg.inv(weighted.T @ common + squared_px / COMMON_PX**2 * np.eye(3))
+    mixed = across.T @ weighted
+    return mixed @ inverse @ mixed.T, mixed @ inverse @ (weighted.T @ off)
+
+
+def corrected(
+    texture: PushedTexture, others: tuple[Array, Array], squared_px: float, scale: Array, before: Array
+) -> ReferenceCorrection:
+    """The reference's error by a frame's normal equations.
+
+    Parameters
+    ----------
+    texture : the points, whose residuals a correction before has changed already.
+    others : Hessian (d + 6, d + 6) and gradient (d + 6,) of all measurements, the points too, and of what else is
+        known, without what the outline does not tell.
+    squared_px : variance of a number of weight one, times how many points of the texture count as one.
+    scale : (d + 6,) of the unknowns.
+    before : (c,) the error factors that were corrected.
+    """
+    (hessian, gradient), frame, transfer = others, texture.frame, texture.transfer
+    stated = squared_px * np.eye(len(before))
+    pushed = frame.hessian @ transfer
+    gain, by_points = inverse_of_seen(hessian, scale) @ pushed, stated + transfer.T @ pushed
+    information = by_points - pushed.T @ gain
+    push = transfer.T @ frame.products(frame.residuals[:, :, None])[:, 0]
+    found = before - np.linalg.solve(information, push + stated @ before - gain.T @ gradient)
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    # No measurement makes the registration worse known than it was; rounding may seem to.
+    shares = np.clip(squared_px / np.maximum(values, 1e-300), 0.0, 1.0)
+    left = (vectors * np.sqrt(shares)) @ vectors.T
+    untold = pushed @ np.linalg.solve(by_points, pushed.T)
+    shift = np.einsum("pkn,n->pk", frame.jacobian, transfer @ found)
+    return ReferenceCorrection(found, shift, transfer, left, untold)

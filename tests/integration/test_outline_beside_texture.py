@@ -1,0 +1,106 @@
+"""A block with a few spots, registered by clicks that are a pixel off, followed by its spots and its outline."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.camera import Camera
+from morph_dslam.geometry import RigidTransform, rotation_exp
+from morph_dslam.model import SurfacePoints
+from morph_dslam.registration.registration import Registration
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.render.texture import render_textured
+from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from tests.support.rendered_sequence import UPRIGHT, colours
+from tests.support.turning_block import BlockFilm
+
+CAMERA = Camera(640, 480, 800.0, 800.0, 319.5, 239.5)
+FINE = 3
+FINER = Camera(FINE * 640, FINE * 480, FINE * 800.0, FINE * 800.0, FINE * 319.5 + 1.0, FINE * 239.5 + 1.0)
+CLICK_PX, N_CLICKS = 1.0, 14
+
+
+def state(time) -> State:
+    parameters = np.array([0.012 * np.sin(6.0 * time), np.radians(10) * np.sin(4.0 * time)])
+    turn = rotation_exp(np.array([0.3 + 0.05 * time, 0.25 * time + 0.4, 0.1]))
+    return State(parameters, RigidTransform(turn @ UPRIGHT, np.array([0.01 * np.sin(3.0 * time), 0.0, 0.5])))
+
+
+class SpottedFilm(BlockFilm):
+    """The block in one grey with spots, before a plain background, with antialiased edges."""
+
+    def __init__(self, spots, seed):
+        super().__init__(seed=seed)
+        self._print = np.full_like(self._print, 90)
+        height, width = self._print.shape
+        for place in self.rng.uniform(0.0, [width, height], (spots, 2)):
+            cv2.circle(self._print, place.astype(int).tolist(), 5, 30, -1, cv2.LINE_AA)
+
+    def frame(self, state, noise=2.0):
+        nodes = state.camera_from_object.apply(self.model.positions(state.parameters))[self._rows]
+        size = FINER.height, FINER.width
+        buffers = rasterise(FINER.project(nodes), nodes[:, 2], self._triangles, *size, closed=True)
+        block = render_textured(buffers, self._triangles, self._places, self._print)
+        image = np.where(buffers.covered, block, 180.0)
+        image = cv2.resize(image, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+        return colours(cv2.GaussianBlur(image, (0, 0), 0.6) + noise * self.rng.standard_normal(image.shape))
+
+
+def clicked(model, there, rng) -> Registration:
+    """The block in the state that clicks on its nodes give, with the covariance that their deviation gives it."""
+    chosen = rng.choice(len(model.triangles), N_CLICKS, replace=False)
+    points = BoundPoints.from_surface(model, SurfacePoints(chosen, np.tile([1.0, 0.0, 0.0], (N_CLICKS, 1))))
+    pixels = CAMERA.project(points.in_camera(there)) + CLICK_PX * rng.standard_normal((N_CLICKS, 2))
+    estimator, weights = Estimator(model, CAMERA), np.ones(N_CLICKS)
+    found = estimator.estimate(points, pixels, weights, there)
+    hessian = estimator.evaluate(points, pixels, weights, found.state)[1]
+    return Registration(model, found.state, CLICK_PX**2 * np.linalg.inv(hessian))
+
+
+def errors(film, known, times, **options):
+    """Errors (f, 2) of both parameters over half of their ranges, and what is stated of them."""
+    options = md.TrackerOptions(least_inliers=16, new_views=False, **options)
+    tracker = md.Tracker(film.model, CAMERA, known, options, reference=film.frame(state(0.0)))
+    off, stated, half = [], [], 0.5 * (film.model.upper - film.model.lower)
+    for time in times:
+        result = tracker.track(film.frame(state(time)))
+        assert result.estimate is not None
+        off.append((result.estimate.state.parameters - state(time).parameters) / half)
+        stated.append(result.estimate.parameter_std / half)
+    return np.array(off), np.array(stated)
+
+
+def test_an_outline_makes_good_what_clicks_were_off_by():
+    """The clicks have the bend off by a tenth of its range; the outline tells it a hundred times as exactly."""
+    film = SpottedFilm(60, 3)
+    known = clicked(film.model, state(0.0), np.random.default_rng(3))
+    half = 0.5 * (film.model.upper - film.model.lower)
+    by_clicks = np.abs(known.state.parameters - state(0.0).parameters) / half
+    off, stated = errors(film, known, (0.0, 0.1), use_outline=True)
+    assert by_clicks[0] > 0.1
+    assert np.abs(off).max() < 0.01
+    assert np.all(np.abs(off) < 3.0 * stated)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spots", [60, 300])
+def test_texture_beside_an_outline_does_no_harm(spots):
+    """Root mean square errors over registrations: with both no larger than by the better one of the two."""
+    found = {"outline": [], "texture": [], "both": []}
+    options = {"outline": {"use_texture": False}, "texture": {}, "both": {"use_outline": True}}
+    deviations = []
+    for seed in range(4):
+        for name, rows in found.items():
+            film = SpottedFilm(spots, seed)
+            known = clicked(film.model, state(0.0), np.random.default_rng(seed))
+            off, stated = errors(film, known, np.linspace(0.0, 0.6, 6), **options[name])
+            rows.append(off)
+            if name == "both":
+                deviations.append(np.abs(off) / stated)
+    outline, texture, both = (np.sqrt(np.mean(np.square(found[name]))) for name in ("outline", "texture", "both"))
+    assert both < 1.5 * outline
+    assert both < 0.2 * texture
+    assert np.mean(np.array(deviations) < 2.0) > 0.9

@@ -1,0 +1,141 @@
+"""The reference's error by an outline, against one least squares fit of all unknowns."""
+
+import numpy as np
+import pytest
+
+from morph_dslam.tracking.linearization import Linearization
+from morph_dslam.tracking.reference_correction import (
+    COMMON_PX,
+    CorrectionCheck,
+    PushedTexture,
+    corrected,
+    of_common_errors,
+)
+
+N_POINTS, N_OUTLINE, N_UNKNOWNS, N_FACTORS = 12, 30, 5, 4
+SQUARED_PX, WEIGHT = 0.04, 0.3
+#: Of the points whose fits are checked: how many, their deviation, pixels, and what the correction moves them by.
+N_CHECKED, NOISE_PX, SHIFT_PX = 60, 0.2, 0.4
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Derivatives of points and of an outline by the unknowns, the outline's normals, and residuals of both."""
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(0.0, 2.0 * np.pi, N_OUTLINE)
+    return (
+        rng.standard_normal((N_POINTS, 2, N_UNKNOWNS)),
+        rng.standard_normal((N_UNKNOWNS, N_FACTORS)),
+        rng.standard_normal((N_OUTLINE, N_UNKNOWNS)),
+        np.column_stack([np.cos(angles), np.sin(angles)]),
+        rng.standard_normal((N_POINTS, 2)),
+        rng.standard_normal(N_OUTLINE),
+    )
+
+
+def correction(frame):
+    jacobian, transfer, across, normals, residuals, off = frame
+    points = Linearization.of(jacobian, residuals, np.ones(N_POINTS), 1e3)
+    weights = np.full(N_OUTLINE, WEIGHT)
+    flat = jacobian.reshape(-1, N_UNKNOWNS)
+    hessian = flat.T @ flat + WEIGHT * across.T @ across
+    gradient = flat.T @ residuals.ravel() + WEIGHT * across.T @ off
+    common = of_common_errors(across, off, weights, normals, SQUARED_PX)
+    whole = hessian - common[0], gradient - common[1]
+    texture = PushedTexture(points, transfer)
+    return corrected(texture, whole, SQUARED_PX, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))
+
+
+def design(frame):
+    """Rows of one fit of state, error factors and errors of the whole outline, in deviations of a number."""
+    jacobian, transfer, across, normals, residuals, off = frame
+    flat, sigma = jacobian.reshape(-1, N_UNKNOWNS), np.sqrt(SQUARED_PX)
+    common = np.column_stack([np.ones(N_OUTLINE), normals])
+    nothing = np.zeros
+    rows = np.block(
+        [
+            [flat, flat @ transfer, nothing((2 * N_POINTS, 3))],
+            [np.sqrt(WEIGHT) * across, nothing((N_OUTLINE, N_FACTORS)), np.sqrt(WEIGHT) * common],
+            [nothing((N_FACTORS, N_UNKNOWNS)), sigma * np.eye(N_FACTORS), nothing((N_FACTORS, 3))],
+            [nothing((3, N_UNKNOWNS + N_FACTORS)), sigma / COMMON_PX * np.eye(3)],
+        ]
+    )
+    return rows, np.concatenate([residuals.ravel(), np.sqrt(WEIGHT) * off, np.zeros(N_FACTORS + 3)])
+
+
+def test_it_is_that_of_one_fit_of_all_unknowns(frame):
+    found, (rows, left) = correction(frame), design(frame)
+    together = np.linalg.lstsq(rows, -left)[0]
+    of_factors = slice(N_UNKNOWNS, N_UNKNOWNS + N_FACTORS)
+    np.testing.assert_allclose(found.found, together[of_factors], rtol=1e-8)
+    covariance = SQUARED_PX * np.linalg.inv(rows.T @ rows)[of_factors, of_factors]
+    np.testing.assert_allclose(found.left @ found.left, covariance, rtol=1e-8)
+    moves = np.einsum("pkn,n->pk", frame[0], frame[1] @ together[of_factors])
+    np.testing.assert_allclose(found.shift, moves, rtol=1e-8)
+
+
+def test_what_the_points_still_tell_is_what_is_left_beside_unknown_error_factors(frame):
+    found = correction(frame)
+    jacobian = frame[0].reshape(-1, N_UNKNOWNS)
+    by_factors = jacobian @ frame[1]
+    covariance = np.eye(2 * N_POINTS) + by_factors @ by_factors.T / SQUARED_PX
+    told = jacobian.T @ np.linalg.solve(covariance, jacobian)
+    np.testing.assert_allclose(jacobian.T @ jacobian - found.untold, told, rtol=1e-8, atol=1e-10)
+
+
+def test_without_an_outline_the_registration_stays_as_it_is(frame):
+    """At the minimum of the points' own cost, where the outline has no points."""
+    jacobian, transfer, *_ = frame
+    flat = jacobian.reshape(-1, N_UNKNOWNS)
+    noise = np.random.default_rng(1).standard_normal(2 * N_POINTS)
+    residuals = (noise - flat @ np.linalg.lstsq(flat, noise)[0]).reshape(-1, 2)
+    points = Linearization.of(jacobian, residuals, np.ones(N_POINTS), 1e3)
+    whole = flat.T @ flat, np.zeros(N_UNKNOWNS)
+    found = corrected(PushedTexture(points, transfer), whole, 1.0, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))
+    np.testing.assert_allclose(found.found, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.left, np.eye(N_FACTORS), atol=1e-10)
+
+
+def checked(check, rng, pull_px=0.0, frames=1):
+    """Let a check see frames whose points an outline draws along, from where they fit, by so much and by their noise.
+
+    The points are fitted by themselves, and then again with the state off by a draw of its own covariance.
+    """
+    for _ in range(frames):
+        jacobian = rng.standard_normal((2 * N_CHECKED, N_UNKNOWNS))
+        noise = NOISE_PX * rng.standard_normal(2 * N_CHECKED)
+        alone = noise - jacobian @ np.linalg.lstsq(jacobian, noise)[0]
+        covariance = NOISE_PX**2 * np.linalg.inv(jacobian.T @ jacobian)
+        pulled = jacobian @ rng.standard_normal(N_UNKNOWNS)
+        pulled *= pull_px / np.sqrt(np.mean(pulled**2))
+        beside = alone + pulled + jacobian @ rng.multivariate_normal(np.zeros(N_UNKNOWNS), covariance)
+        shift = np.full((N_CHECKED, 2), SHIFT_PX)
+        check.learn(alone.reshape(-1, 2), beside.reshape(-1, 2), shift, np.ones(N_CHECKED), 1.0, N_UNKNOWNS)
+    return check.is_refuted
+
+
+def test_noise_does_not_refute_a_correction():
+    """A draw as far off as four deviations comes in one first frame of 16000."""
+    rng = np.random.default_rng(2)
+    assert not any(checked(CorrectionCheck(), rng) for _ in range(1000))
+
+
+def test_what_a_correction_to_first_order_lacks_does_not_refute_it():
+    rng = np.random.default_rng(3)
+    assert not any(checked(CorrectionCheck(), rng, 0.05 * SHIFT_PX) for _ in range(1000))
+
+
+def test_points_that_are_drawn_from_where_they_fit_refute_it():
+    """By as much as their noise: the registration's error would have left them where they fit."""
+    rng = np.random.default_rng(4)
+    assert all(checked(CorrectionCheck(), rng, NOISE_PX) for _ in range(100))
+
+
+def test_clutter_that_passes_does_not_refute_it_and_what_stays_does():
+    rng, check = np.random.default_rng(5), CorrectionCheck()
+    assert not checked(check, rng, frames=6)
+    assert not checked(check, rng, 1.0, frames=3)
+    assert not checked(check, rng, frames=2)
+    assert not checked(check, rng, 1.0, frames=5)
+    assert checked(check, rng, 1.0)
+    assert checked(check, rng, frames=20), "given up for good"
