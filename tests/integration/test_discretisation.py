@@ -200,7 +200,7 @@ def test_second_order_elements_are_compared_with_third_order(tmp_path: Path) -> 
     ("changes", "why"),
     [
         ({"MOST_BYTES": 1.0}, "GB of memory"),
-        ({"FLOOR": 0.0}, "more than a quarter"),
+        ({"FLOOR": 0.0, "SHARE": 0.01}, "solves, more than a quarter"),
         ({"FLOOR": 1e-9, "FINER_TANGENTS": 1e-12, "SWEEP_TANGENTS": 1e-9}, "states would take more than a quarter"),
     ],
 )
