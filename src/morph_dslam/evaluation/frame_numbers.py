@@ -12,6 +12,7 @@ from morph_dslam.errors import EvaluationError
 from morph_dslam.evaluation.pixels import PixelError, PixelTracks, pixel_error
 from morph_dslam.evaluation.points import MaterialError, PointTruth, material_error
 from morph_dslam.evaluation.run_folder import Run
+from morph_dslam.even_rows import evenly
 
 Array = NDArray[np.float64]
 #: Numbers that a file may be off by, as where it counts frames from one.
@@ -69,7 +70,7 @@ def track_notes(run: Run, tracks: PixelTracks, error: PixelError, bind_frame: in
 
 def spread_over(frames: NDArray[np.int64]) -> NDArray[np.int64]:
     """`COMPARED` of them, spread over all."""
-    return frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).astype(int))]
+    return frames[evenly(len(frames), COMPARED)]
 
 
 def _notes(mean_error: Callable[[int], float], of: str, unit: str) -> list[str]:

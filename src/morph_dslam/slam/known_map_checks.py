@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError
+from morph_dslam.even_rows import evenly
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.notices import Notice
 from morph_dslam.slam.camera_terms import CameraEstimate
@@ -89,7 +90,7 @@ def focal_note(
     focal = found.terms["focal"]
     if not focal.departure > max(LEAST_DEPARTURE, CLEARLY * focal.departure_std):
         return None
-    rows = np.unique(np.linspace(0, len(path) - 1, MOST_FRAMES).astype(int))
+    rows = evenly(len(path), MOST_FRAMES)
     rows = rows[[len(seen[row].ids) >= LEAST_INLIERS for row in rows]]
     ratio = focal.estimated[0] / focal.given[0]
     if not _miss(ratio, rows, rigid_map, camera, path, seen) < _miss(1.0, rows, rigid_map, camera, path, seen):
@@ -160,7 +161,7 @@ def moved_part(
         if index in poses and index in seen and len(points.ids) >= LEAST_ASTRAY
     }
     frames = [index for index, share in shares.items() if share >= LEAST_SHARE]
-    rows = np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).astype(int)) if frames else []
+    rows = evenly(len(frames), MOST_FRAMES)
     shifts = {frames[row]: _shift(rigid_map, camera, poses[frames[row]], astray[frames[row]]) for row in rows}
     found = {index: shift for index, shift in shifts.items() if shift is not None}
     if len(found) < LEAST_FRAMES or 2 * len(found) < len(shifts):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError
+from morph_dslam.even_rows import evenly
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.slam.camera_adjustment import CAMERA_STEPS, Solution, Views, solve
 from morph_dslam.slam.camera_terms import (
@@ -84,7 +85,7 @@ class _Recording:
 
     def _chosen(self, rows: Indices, n_points: int) -> tuple[Indices, Indices]:
         """Some of the frames, spread, and the points that most of them saw; no frame that saw few of these."""
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_FRAMES)).astype(int))]
+        rows = rows[evenly(len(rows), MOST_FRAMES)]
         n_views = np.zeros(n_points, dtype=np.int64)
         for row in rows:
             n_views[self._seen[row].ids] += 1

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.even_rows import evenly
 from morph_dslam.row_products import FAST
 from morph_dslam.tracking.state import State
 
@@ -41,14 +41,6 @@ FACTOR_TOLERANCE = 0.01
 MOST_COMPARED = 256
 #: An estimate that takes up more of the model's error leaves too little to tell how large it is.
 LEAST_LEFT = 0.02
-
-
-@lru_cache(maxsize=64)
-def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """At most ``most`` of ``count`` rows, spread evenly from the first to the last; kept, so not to be changed."""
-    rows = np.linspace(0, count - 1, min(most, count)).astype(np.int64)
-    rows.flags.writeable = False
-    return rows
 
 
 class SharedErrors:

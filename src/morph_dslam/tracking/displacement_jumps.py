@@ -16,9 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from morph_dslam.even_rows import evenly
 from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.row_products import FAST
-from morph_dslam.tracking.covariance import evenly
 
 Array = NDArray[np.float64]
 #: Places, as many as there may be, and how far the points of one reach, as a share of the object's diagonal.

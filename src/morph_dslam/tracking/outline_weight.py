@@ -14,7 +14,8 @@ import scipy.sparse
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.tracking.covariance import LEAST_SPREAD_PX as LEAST_NOISE_PX, evenly
+from morph_dslam.even_rows import evenly
+from morph_dslam.tracking.covariance import LEAST_SPREAD_PX as LEAST_NOISE_PX
 from morph_dslam.tracking.noise import middle
 from morph_dslam.tracking.outline import OutlineMeasurement
 
@@ -66,7 +67,7 @@ class ErrorComponent:
 
         ``pixels`` (p, 2) are those of the points.
         """
-        compared = np.unique(np.linspace(0, len(pixels) - 1, MOST_COMPARED).astype(np.int64))
+        compared = evenly(len(pixels), MOST_COMPARED)
         alike = float(mean_correlation(pixels[compared], FIRST_LENGTH_PX))
         self.variance, self.redundancy = variance, 1.0 + (len(pixels) - 1) * alike
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
+from morph_dslam.even_rows import evenly
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
@@ -22,7 +23,6 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring, CameraLocalization
 from morph_dslam.tracking.compilation import announce_compilation
-from morph_dslam.tracking.covariance import evenly
 from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
