@@ -80,7 +80,7 @@ def test_what_the_points_still_tell_is_what_is_left_beside_unknown_error_factors
     by_factors = jacobian @ frame[1]
     covariance = np.eye(2 * N_POINTS) + by_factors @ by_factors.T / SQUARED_PX
     told = jacobian.T @ np.linalg.solve(covariance, jacobian)
-    np.testing.assert_allclose(jacobian.T @ jacobian - found.untold, told, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(jacobian.T @ jacobian - found.information_lost, told, rtol=1e-8, atol=1e-10)
 
 
 def test_without_an_outline_the_registration_stays_as_it_is(frame):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.model.separated import combine_modes
+from morph_dslam.tracking.reprojection import huber_weights
 from morph_dslam.tracking.state import BoundPoints, State
 
 Array = NDArray[np.float64]
@@ -97,7 +98,7 @@ class PointDepths:
 
     def bounded(self, residuals: Array) -> Array:
         """Residuals (p,) whose squares are twice Huber's cost's weighted squares: large ones by their root."""
-        return residuals * np.sqrt(np.minimum(1.0, self.huber_px / np.maximum(np.abs(residuals), 1e-12)))
+        return residuals * np.sqrt(huber_weights(np.abs(residuals), self.huber_px))
 
     def take(self, rows: NDArray[Any]) -> PointDepths:
         """Those of some points."""

@@ -304,11 +304,7 @@ class Estimator:
 
     def jacobian(self, points: BoundPoints, state: State) -> Array:
         """Derivatives (p, 2, d + 6) of the points' pixels at a state; NaN behind the camera."""
-        pose = state.camera_from_object
-        return project_with_jacobian(
-            points.field.functions.rows(state.parameters), pose.rotation, pose.translation,
-            points.rest, points.field.modes, self.camera.intrinsics,
-        )[1]  # fmt: skip
+        return project_with_jacobian(*points.in_state(state), self.camera.intrinsics)[1]
 
     def within(self, box: Box) -> Self:
         """The same, whose parameters stay in another box."""

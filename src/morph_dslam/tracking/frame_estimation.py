@@ -391,11 +391,10 @@ class FrameEstimation:
         """The attempt with what its outline tells of the reference's error, and the minimum then."""
         found = estimator.fitted(self._with_outline(attempt), start, attempt.prior)
         texture, rows = self._balance.texture, slice(len(attempt.inliers))
-        if systematic is None or attempt.outline is None or not attempt.outline.valid.any():
+        seen = attempt.outline
+        if systematic is None or seen is None or not seen.valid.any() or np.isnan(texture.variance):
             return attempt, found
         pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights)
-        if pushed is None or np.isnan(texture.variance):
-            return attempt, found
         correction = reference_correction(
             self._estimator, self._with_outline(attempt), found, attempt.prior, pushed, texture.independent,
             attempt.correction,
@@ -404,8 +403,8 @@ class FrameEstimation:
         return attempt, estimator.fitted(self._with_outline(attempt), found.state, attempt.prior)
 
     def _told(self, attempt: PoseHypothesis, found: Minimum) -> Array:
-        """The Hessian (d + 6, d + 6) at a minimum, less what the points do not tell as the reference is off."""
-        return found.hessian if attempt.correction is None else found.hessian - attempt.correction.untold
+        """The Hessian (d + 6, d + 6) at a minimum, less what the reference's error takes from the points."""
+        return found.hessian if attempt.correction is None else found.hessian - attempt.correction.information_lost
 
     def _uncovered(self, seen: OutlineMeasurement, attempt: PoseHypothesis, state: State) -> OutlineMeasurement:
         """The outline without what lies beside texture that should be seen and was not found.

@@ -30,6 +30,7 @@ from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.outline_weight import mean_square
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, REFUTED
+from morph_dslam.tracking.reprojection import huber_weights
 from morph_dslam.tracking.state import Prior
 
 Array = NDArray[np.float64]
@@ -65,14 +66,14 @@ class ReferenceCorrection:
     shift : (p, 2) pixels, by which it moves the texture's points in the frame.
     transfer : (d + 6, c) as of `PushedTexture`.
     left : (c, c), a symmetric root of the covariance that is left of them, the stated one being the identity.
-    untold : (d + 6, d + 6) of the points' Hessian, what they do not tell of the object as the reference is off.
+    information_lost : (d + 6, d + 6) of the points' Hessian, what the unknown error of the reference takes from it.
     """
 
     found: Array
     shift: Array
     transfer: Array
     left: Array
-    untold: Array
+    information_lost: Array
 
 
 class CorrectionCheck:
@@ -142,7 +143,7 @@ def reference_correction(
     jacobian, outline = estimator.jacobian(together.points, state)[count:], slice(count, None)
     across = np.einsum("pkn,pk->pn", jacobian, together.normals[outline])
     off = np.einsum("pk,pk->p", residuals[outline], together.normals[outline])
-    huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.abs(off), 1e-300))
+    huber = huber_weights(np.abs(off), estimator.options.huber_px)
     weights = np.where(np.isfinite(off), together.weights[outline] * huber, 0.0)
     used = weights > 0.0
     common = of_common_errors(across[used], off[used], weights[used], together.normals[outline][used], squared_px)
@@ -195,6 +196,6 @@ def corrected(
     # No measurement makes the registration worse known than it was; rounding may seem to.
     shares = np.clip(squared_px / np.maximum(values, 1e-300), 0.0, 1.0)
     left = (vectors * np.sqrt(shares)) @ vectors.T
-    untold = pushed @ np.linalg.solve(by_points, pushed.T)
+    information_lost = pushed @ np.linalg.solve(by_points, pushed.T)
     shift = np.einsum("pkn,n->pk", frame.jacobian, transfer @ found)
-    return ReferenceCorrection(found, shift, transfer, left, untold)
+    return ReferenceCorrection(found, shift, transfer, left, information_lost)

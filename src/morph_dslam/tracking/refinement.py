@@ -25,6 +25,7 @@ from morph_dslam.tracking.estimator import BoundPoints, Estimator, State, moved
 from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.outline import OutlineMeasurement
+from morph_dslam.tracking.reprojection import huber_weights
 
 Array = NDArray[np.float64]
 #: Step of scaled unknowns that derivatives are differences over, on the way to a minimum and for its covariance.
@@ -217,8 +218,7 @@ def _frame_residuals(inner: Estimator, points: BoundPoints, met: NDArray[np.bool
     """Scaled residuals of a keyframe at its best state, with Huber weights; 0 for points unused."""
     measured = frame.measured(points, met)
     estimate, weights = inner.fit(measured, frame.state), measured.weights
-    length = np.linalg.norm(estimate.residuals, axis=1)
-    huber = np.minimum(1.0, inner.options.huber_px / np.maximum(length, 1e-12))
+    huber = huber_weights(np.linalg.norm(estimate.residuals, axis=1), inner.options.huber_px)
     sigma = max(frame.sigma_px, LEAST_SIGMA_PX)
     share = np.sqrt(EFFECTIVE_POINTS / max(weights.sum(), 1.0)) / sigma
     found = (share * np.sqrt(weights * huber))[:, None] * np.nan_to_num(estimate.residuals)

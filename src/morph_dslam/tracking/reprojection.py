@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from morph_dslam.model.separated import combine_modes
 from morph_dslam.row_products import FAST, row_products
@@ -17,6 +18,11 @@ from morph_dslam.row_products import FAST, row_products
 MINIMUM_DEPTH = 1e-3
 #: Cost of a point that the state places behind the camera; large, so that such a step is refused.
 UNSEEN_COST = 1e9
+
+
+def huber_weights(lengths: NDArray[np.float64], huber_px: float) -> NDArray[np.float64]:
+    """Weights of residuals of these lengths by Huber's cost, which is linear from ``huber_px`` on."""
+    return np.minimum(1.0, huber_px / np.maximum(lengths, 1e-12))
 
 
 @njit(cache=True, nogil=True)

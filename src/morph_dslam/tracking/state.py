@@ -65,10 +65,15 @@ class BoundPoints:
         field = self.field.with_modes(self.field.modes[:, rows])
         return BoundPoints(self.surface.take(rows), self.rest[rows], field)
 
-    def in_state(self, state: State) -> tuple[Array, Array, Array, Array, NDArray[np.floating]]:
-        """What compiled functions take of the points in a state; see `reprojection.linearise`."""
+    def in_state(
+        self, state: State, rows: Array | None = None
+    ) -> tuple[Array, Array, Array, Array, NDArray[np.floating]]:
+        """What compiled functions take of the points in a state; see `reprojection.linearise`.
+
+        ``rows`` (1 + d, m) : other values and derivatives of the functions than those of the state.
+        """
         pose = state.camera_from_object
-        rows = self.field.functions.rows(state.parameters)
+        rows = self.field.functions.rows(state.parameters) if rows is None else rows
         return rows, pose.rotation, pose.translation, self.rest, self.field.modes
 
     def in_camera(self, state: State) -> Array:

@@ -35,6 +35,7 @@ from morph_dslam.tracking.refinement import (
     minimum,
     reference_scale,
 )
+from morph_dslam.tracking.reprojection import huber_weights
 from morph_dslam.tracking.state import Prior, pose_increment
 
 Array = NDArray[np.float64]
@@ -265,7 +266,7 @@ class StillProblem:
                 measured = replace(measured, depths=depths.padded(len(measured.points)))
             self._own[number], left, far = self._fitted(estimator, measured, state, self._own[number], steps)
             weights = measured.weights
-            huber = np.minimum(1.0, estimator.options.huber_px / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
+            huber = huber_weights(np.linalg.norm(left, axis=1), estimator.options.huber_px)
             left *= np.sqrt(weights * huber * EFFECTIVE_POINTS / max(weights.sum(), 1.0))[:, None] / of_pixels
             scaled = np.zeros((len(met) + len(left) - n_met, 2))
             scaled[: len(met)][met], scaled[len(met) :] = left[:n_met], left[n_met:]

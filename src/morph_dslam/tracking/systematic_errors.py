@@ -302,10 +302,8 @@ class SystematicErrors:
         """Whether the reference's error is known, and none of the pose that holds in all frames."""
         return self._moved is not None and not self._still
 
-    def pushed_texture(self, state: State, residuals: Array, weights: Array) -> PushedTexture | None:
-        """The points in a frame, and how these alone take the reference's error for motion.
-
-        None where nobody knows that error, or where it is the same for the object's pose itself.
+    def pushed_texture(self, state: State, residuals: Array, weights: Array) -> PushedTexture:
+        """The points in a frame, and how these alone take the reference's error for motion, where it is known.
 
         Parameters
         ----------
@@ -313,8 +311,6 @@ class SystematicErrors:
         residuals : (p, 2) that it leaves of the points, pixels.
         weights : (p,) of these.
         """
-        if not self.knows_reference:
-            return None
         frame = Linearization.of(self._project(state)[1], residuals, weights, self._estimator.options.huber_px)
         transfer = inverse_of_seen(frame.hessian, self._estimator.scale) @ self.pushed(frame, state)
         return PushedTexture(frame, transfer)
@@ -399,11 +395,7 @@ class SystematicErrors:
 
     def _project(self, state: State, rows: Array | None = None) -> tuple[Array, Array]:
         """Pixels (p, 2) and their derivatives, by other values and derivatives (1 + d, m) of the functions if given."""
-        points, pose = self._points, state.camera_from_object
-        return project_with_jacobian(
-            points.field.functions.rows(state.parameters) if rows is None else rows, pose.rotation, pose.translation,
-            points.rest, points.field.modes, self._estimator.camera.intrinsics,
-        )  # fmt: skip
+        return project_with_jacobian(*self._points.in_state(state, rows), self._estimator.camera.intrinsics)
 
     def warped(self, state: State, moved: Array) -> Array:
         """How pixels move (p, 2) in the view of a state where they move by ``moved`` (p, 2) in the reference view."""
