@@ -10,7 +10,7 @@ from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.trajectory import Trajectory
 from morph_dslam.registration.register import register
-from morph_dslam.registration.registration import KeyframePose, MapRegistration, registration_in_map
+from morph_dslam.registration.registration import KeyframePose, MapRegistration, in_scene, registration_in_map
 from morph_dslam.registration.registration_file import load_registration
 from morph_dslam.slam.frame_images import FrameImages
 from morph_dslam.slam.local_map import correct_map
@@ -19,7 +19,8 @@ from morph_dslam.slam.options import SlamOptions
 from morph_dslam.slam.result import SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import GOOD, Keyframe, RigidMap
 from morph_dslam.slam.rolling_shutter import after, row_times
-from morph_dslam.slam.scene import Scene, finish_scene, start_slam
+from morph_dslam.slam.scene import Scene, finish_scene, load_scene, start_slam
+from morph_dslam.tracking.views import registered_keyframes
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_room import Film
 
@@ -109,6 +110,78 @@ def test_a_registration_made_before_the_map_grew_is_one_of_it(rounds, tmp_path):
     np.testing.assert_array_equal(there.camera_from_world, at(0.2))
     assert [each.index for each in known.keyframes] == [0, 20]
     assert load_registration(tmp_path / "registration.json", model, known).frame == 20
+
+
+def registered(model, rigid_map):
+    """A registration 2 m before the first camera in all keyframes of a map; only the first two have a covariance."""
+    placed = MapRegistration(
+        SimilarityTransform(1.0, np.eye(3), np.array([0, 0, 2.0])), model.nodes.mean(axis=0), 1e-8 * np.eye(7)
+    )
+    own = [1e-6 * np.eye(6) if k < 2 else None for k in range(len(rigid_map.keyframes))]
+    views = [
+        KeyframePose(each.index, placed.pose_in(each.camera_from_world), covariance)
+        for each, covariance in zip(rigid_map.keyframes, own, strict=True)
+    ]
+    return registration_in_map(model, placed, views, {})
+
+
+def grown(known, *new, gone=()):
+    """A scene whose map has grown by a recording of 120 frames, and has lost known keyframes meanwhile."""
+    slam = start_slam(Film([]), CAMERA, SlamOptions(extend=True), known)
+    for each in new:
+        slam.map.add_keyframe(each)
+    for number in gone:
+        slam.map.remove_keyframe(number, carrier=len(slam.map.keyframes) - 1)
+    return finish_scene(slam, [SlamFrame(k, k / 30, SlamStatus.LOST) for k in range(120)])
+
+
+@pytest.mark.parametrize(
+    ("gone", "frame", "left", "deviation"),
+    [([1], 1027, [0, 13, 27], 5**0.5 * 1e-4), ([3], 1007, [0, 7, 13], 1e-3), ([1, 3], 1000, [0, 13], 1e-3)],
+    ids=["another", "its-own", "both"],
+)
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_a_registration_goes_on_with_the_keyframes_that_a_grown_map_has_left(
+    in_memory, gone, frame, left, deviation, tmp_path
+):
+    """New keyframes whose numbers end alike are nearly where the known ones were."""
+    model, places = bent_sheet_model(8, 6), {0: 0.0, 7: 0.02, 13: 0.05, 27: 0.08}
+    known = Scene(CAMERA, map_of(*(keyframe(number, x) for number, x in places.items())), NO_PATH)
+    registered(model, known.map).save(tmp_path / "registration.json")
+    scene = grown(known, *(keyframe(10 + number, x + 0.01) for number, x in places.items()), gone=gone)
+    if not in_memory:
+        scene.save(tmp_path / "map.h5")
+        scene = load_scene(tmp_path / "map.h5", CAMERA)
+    found = load_registration(tmp_path / "registration.json", model, scene)
+    assert found.frame == frame
+    assert [view.frame for view in found.keyframes] == [1000 + number for number in left]
+    assert found.state.camera_from_object.translation == pytest.approx([-places[frame - 1000], 0.0, 2.0])
+    assert np.sqrt(found.covariance[-1, -1]) == pytest.approx(deviation, rel=0.01)
+    pictures = registered_keyframes(found)
+    assert {pictures[view.frame].normalized.shape for view in found.keyframes} == {(480, 640)}
+    assert in_scene(found, scene).frame == frame
+
+
+def test_a_registration_of_a_grown_map_keeps_its_numbers_until_that_grows_again(tmp_path):
+    model, known = bent_sheet_model(8, 6), Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH)
+    once = grown(known, keyframe(20, 0.25))
+    placed = registered(model, once.map)
+    registration_in_map(model, placed.map_registration, placed.keyframes, {}, scene=once).save(tmp_path / "r.json")
+    twice = grown(once, keyframe(20, 0.28), keyframe(1020, 0.29))
+    for scene, numbers in ((once, [1000, 1020, 20]), (twice, [2000, 2020, 1020])):
+        found = load_registration(tmp_path / "r.json", model, scene)
+        assert [view.frame for view in found.keyframes] == numbers
+    with pytest.raises(MapError):  # it knows of a recording that this one has not grown by
+        load_registration(tmp_path / "r.json", model, known)
+
+
+@pytest.mark.parametrize("numbers", [(0, 7, 13, 28), (1, 8, 14, 28)], ids=["one-missing", "all-missing"])
+def test_a_map_that_never_grew_and_lacks_a_keyframe_of_the_registration_is_another_one(numbers, tmp_path):
+    model, places = bent_sheet_model(8, 6), (0.0, 0.02, 0.05, 0.08)
+    registered(model, map_of(*map(keyframe, (0, 7, 13, 27), places))).save(tmp_path / "registration.json")
+    other = Scene(CAMERA, map_of(*map(keyframe, numbers, places)), NO_PATH)
+    with pytest.raises(MapError, match="no keyframe 27"):
+        load_registration(tmp_path / "registration.json", model, other)
 
 
 def test_landmarks_in_a_number_of_two_recordings_are_refused():

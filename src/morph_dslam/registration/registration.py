@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Keyframes are placed anew by the registration, but never by so much: rad, and share of the distance.
 OTHER_MAP_TURN, OTHER_MAP_SHIFT = 0.1, 0.1
+#: Of many keyframes so many may be placed wrongly.
+OTHER_MAP_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,7 @@ class Registration:
     alternatives : other states that what it was registered by does not exclude, where they are known.
     rivals : other places in the map, the best first.
     depth_scale : of the depth images that say how far away it is, with its error in the covariance; None where none do.
+    renumbered : of its map (`RigidMap`) when the keyframes' numbers here were those of the map.
     """
 
     model: ReducedModel
@@ -221,6 +224,7 @@ class Registration:
     alternatives: tuple[State, ...] = ()
     rivals: tuple[Rival, ...] = ()
     depth_scale: DepthScale | None = None
+    renumbered: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
         """One line: what was registered by what, the parameters, and how many warnings there are."""
@@ -295,6 +299,7 @@ class Registration:
             "mean_node_m": self.map_registration.centre.tolist(),
             "covariance": _list(self.map_registration.covariance),
             "axis_of_revolution": axis and {"point_m": axis.point.tolist(), "direction": axis.direction.tolist()},
+            "map_renumbered": list(self.renumbered),
             "rivals": [
                 {
                     "world_from_object": rival.world_from_object.matrix.tolist(),
@@ -358,11 +363,9 @@ def registration_in_map(
             warnings.append(AngleOpen(*open_angles))
         else:  # nothing deforms it that could come from a side
             warnings.append(TurnArbitrary())
-    of_pose = map_registration.pose_covariance(last.pose) if last.covariance is None else last.covariance
     return Registration(
         model,
-        State(model.default, last.pose),
-        None if of_pose is None else state_covariance(of_pose, len(model.parameters)),
+        *_undeformed_in(last, model, map_registration),
         last.frame,
         facts,
         tuple(warnings),
@@ -371,7 +374,15 @@ def registration_in_map(
         tuple(keyframes),
         axis,
         scene=scene,
+        renumbered=() if scene is None else scene.map.renumbered,
     )
+
+
+def _undeformed_in(view: KeyframePose, model: ReducedModel, in_map: MapRegistration) -> tuple[State, Array | None]:
+    """The state of an undeformed object in a keyframe, and its covariance; None where that is not known."""
+    of_pose = in_map.pose_covariance(view.pose) if view.covariance is None else view.covariance
+    covariance = None if of_pose is None else state_covariance(of_pose, len(model.parameters))
+    return State(model.default, view.pose), covariance
 
 
 def state_covariance(of_pose: Array, n_parameters: int) -> Array:
@@ -385,45 +396,44 @@ def in_scene(registration: Registration, scene: Scene) -> Registration:
     """The registration with its scene; raises MapError if it was made in another one.
 
     Where the map has grown by other recordings since, the registration takes over the numbers that its keyframes have
-    now.
+    now, without those that the map has no more. If its own one is among these, the last one left takes its place.
     """
-    name, in_map, frame = scene.path or "the scene", registration.map_registration, registration.frame
-    poses = {each.index: each.camera_from_world for each in scene.map.keyframes}
-    # Each recording by which a map grows adds the same power of ten to the numbers of all keyframes before it.
-    added = [] if frame is None else [number - frame for number in poses if number >= frame]
-    added = sorted(more for more in added if more % 10 == 0)
-    if not added or in_map is None:
-        raise MapError(f"{name} is not the map of the registration: it has no keyframe {frame}")
-    more = min(added, key=lambda more: _apart_in(registration, in_map, poses, more))
-    assert frame is not None
-    turn, shift = _away(in_map, poses[frame + more], registration.state.camera_from_object)
-    if turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * np.linalg.norm(
-        registration.state.camera_from_object.translation
-    ):
+    name, in_map, before = scene.path or "the scene", registration.map_registration, registration.renumbered
+    if in_map is None or registration.frame is None:
+        raise MapError(f"{name} is not the map of the registration: it was made without one")
+    poses = {each.index: each.camera_from_world for each in scene.keyframes}
+    since = scene.map.renumbered[len(before) :]
+    more, now = sum(since), scene.map.renumbered[: len(before)]
+    views = [replace(view, frame=view.frame + more) for view in registration.keyframes]
+    gone = [view.frame - more for view in views if view.frame not in poses]
+    # Only a map that grows takes keyframes out.
+    if now != before or len(gone) == len(views) or (gone and not since):
+        missing = max(gone, default=registration.frame)
+        raise MapError(f"{name} is not the map of the registration: it has no keyframe {missing} of it")
+    views = [view for view in views if view.frame in poses]
+    frame = registration.frame + more
+    # One without a covariance of its own is of no use beside others that have one: see `Registration.views`.
+    last = max(views, key=lambda view: (view.frame == frame, view.covariance is not None, view.frame))
+    off = {view.frame: _away(in_map, poses[view.frame], view.pose) for view in views}
+    far = [view for view in views if _is_elsewhere(view, *off[view.frame])]
+    if _is_elsewhere(last, *off[last.frame]) or len(far) > OTHER_MAP_SHARE * len(views):
+        turn, shift = off[far[-1].frame]
         raise MapError(
             f"{name} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
-            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {frame}"
+            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {far[-1].frame - more}"
         )
-    views = tuple(replace(view, frame=view.frame + more) for view in registration.keyframes)
-    return replace(registration, scene=scene, frame=frame + more, keyframes=views)
+    found = replace(
+        registration, scene=scene, frame=last.frame, keyframes=tuple(views), renumbered=scene.map.renumbered
+    )
+    if last.frame == frame:
+        return found
+    state, covariance = _undeformed_in(last, registration.model, in_map)
+    return replace(found, state=state, covariance=covariance)
 
 
-def _apart_in(
-    registration: Registration, in_map: MapRegistration, poses: dict[int, Array], more: int
-) -> tuple[int, float]:
-    """How far a map is from that of a registration whose keyframes' numbers are larger by so much in it.
-
-    Returns
-    -------
-    How many of the keyframes it has not, and the mean of what the object is off in the others, as a share of the
-    distance.
-    """
-    off = []
-    for view in registration.keyframes:
-        if view.frame + more in poses:
-            turn, shift = _away(in_map, poses[view.frame + more], view.pose)
-            off.append(turn + shift / float(np.linalg.norm(view.pose.translation)))
-    return len(registration.keyframes) - len(off), float(np.mean(off)) if off else np.inf
+def _is_elsewhere(view: KeyframePose, turn: float, shift: float) -> bool:
+    """Whether an object that is off by so much (rad, metres) in a keyframe is that of another map."""
+    return turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * float(np.linalg.norm(view.pose.translation))
 
 
 def _away(in_map: MapRegistration, camera_from_world: Array, pose: RigidTransform) -> tuple[float, float]:

@@ -149,6 +149,7 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
         file.attrs["camera_notes"] = json.dumps(rigid_map.camera_notes)
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs["has_given_lengths"] = rigid_map.has_given_lengths
+        file.attrs["renumbered"] = json.dumps(rigid_map.renumbered)
         file.attrs.update({"intrinsics": camera.intrinsics, "size": (camera.width, camera.height)})
         file.attrs.update({"distortion": camera.distortion, "lens_model": camera.lens_model})
         file.attrs["readout_s"] = camera.readout_s
@@ -264,6 +265,7 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
         raise MapError(f"{path} is empty: the run that wrote it never began a map")
     rigid_map = RigidMap(float(np.asarray(file.attrs["baseline_px"])))
     rigid_map.has_given_lengths = _has_given_lengths(file)
+    rigid_map.renumbered = tuple(json.loads(str(file.attrs.get("renumbered", "[]"))))
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
     notes = json.loads(str(file.attrs.get("camera_notes", "[]")))
     rigid_map.camera_notes = (*notes, *_lens_note(path, file, camera))

@@ -246,6 +246,7 @@ class RigidMap:
     baseline_px : focal length times the baseline that right columns refer to, px m; 0 where no depth is
         measured, and lengths are in map units instead of metres.
     has_given_lengths : whether lengths are those of poses that were given.
+    renumbered : what each recording that it grew by added to the numbers of all keyframes before, the latest last.
     passing : frames that are not kept, but tell which candidates move.
     camera_notes : what its recording showed to be wrong with its camera, for people.
     """
@@ -256,6 +257,7 @@ class RigidMap:
         self.usual_rms_px = FIRST_RMS_PX
         self.camera_notes: tuple[str, ...] = ()
         self.has_given_lengths = False
+        self.renumbered: tuple[int, ...] = ()
         self.passing = PassingViews()
         self.positions = np.empty((0, 3))
         self.state = np.empty(0, dtype=np.int8)
@@ -293,6 +295,7 @@ class RigidMap:
         """Another map that is what this one is now, and may change by itself."""
         other = RigidMap(self.baseline_px)
         other.camera_notes, other.has_given_lengths = self.camera_notes, self.has_given_lengths
+        other.renumbered = self.renumbered
         other.copy_of(self)
         return other
 

@@ -316,8 +316,10 @@ def finish_scene(slam: Slam, frames: Sequence[SlamFrame], recording: FrameSource
 def _number_apart(slam: Slam, frames: Sequence[SlamFrame]) -> None:
     """Add a power of ten to the known keyframes' numbers, so that no frame of the recording has one of them."""
     taken = max((frame.index for frame in frames), default=0)
+    more = 10 ** len(str(taken))
     for keyframe in slam.map.keyframes[: slam.n_known]:
-        keyframe.index += 10 ** len(str(taken))
+        keyframe.index += more
+    slam.map.renumbered += (more,)
 
 
 def trajectory_of(slam: Slam, frames: Sequence[SlamFrame]) -> Trajectory:

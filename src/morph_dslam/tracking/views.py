@@ -146,7 +146,7 @@ def registered_keyframes(registration: Registration) -> dict[int, Keyframe]:
     """
     if registration.scene is None:
         return {}
-    return {keyframe.index: keyframe for keyframe in registration.scene.map.keyframes}
+    return {keyframe.index: keyframe for keyframe in registration.scene.keyframes}
 
 
 def image_of(keyframe: Keyframe) -> Image:
