@@ -73,12 +73,23 @@ def test_keyframes_of_a_known_map_keep_their_velocity_where_it_grows(first):
     assert np.abs(moved).max() < 1e-4
 
 
-def test_a_map_that_grew_has_one_keyframe_of_each_number():
+@pytest.mark.parametrize("is_frozen", [False, True])
+def test_a_map_that_grew_has_one_keyframe_of_each_number(is_frozen):
+    """Also where it was frozen after that, as by --freeze-at."""
     known = Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH)
     slam = start_slam(Film([]), CAMERA, SlamOptions(extend=True), known)
     slam.map.add_keyframe(keyframe(20, 0.4))
+    if is_frozen:
+        slam.freeze()
     scene = finish_scene(slam, [SlamFrame(k, k / 30, SlamStatus.LOST) for k in range(90, 120)])
     assert [each.index for each in scene.keyframes] == [1000, 1020, 20]
+
+
+def test_a_map_that_did_not_grow_keeps_its_numbers():
+    known = Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH)
+    slam = start_slam(Film([]), CAMERA, SlamOptions(extend=True), known)
+    scene = finish_scene(slam, [SlamFrame(k, k / 30, SlamStatus.LOST) for k in range(90, 120)])
+    assert [each.index for each in scene.keyframes] == [0, 20]
 
 
 def test_a_known_map_is_kept_however_long_the_camera_is_elsewhere():

@@ -308,7 +308,7 @@ def finish_scene(slam: Slam, frames: Sequence[SlamFrame], recording: FrameSource
     for _ in range(rolling_shutter.ROUNDS if slam.camera.readout_s and not slam.is_frozen else 0):
         correct_map(slam.map, slam.camera, trajectory, slam.n_known if slam.is_of_other_recording else 0)
         trajectory = trajectory_of(slam, frames)
-    if slam.is_of_other_recording and not slam.is_frozen:
+    if slam.is_of_other_recording and len(slam.map.keyframes) > slam.n_known:
         _number_apart(slam, frames)
     return Scene(slam.camera, slam.map, trajectory, tuple(frames), slam)
 
