@@ -297,13 +297,18 @@ def test_landmarks_close_to_a_line_have_the_deviation_of_the_turn_about_it(seed)
     assert np.deg2rad(1.0) < deviation < np.deg2rad(10.0)
 
 
-def strip_at_rest(width_m, seed, aid=None):
+def strip_at_rest(width_m, seed, aid=None, folder=None):
     """A strip of 420 mm at rest, half tilted about its length: the error of that turn and its deviation, rad.
 
     ``aid`` : "depth" or "image" of the frame, which has a pixel's noise of its own; the landmarks alone by default.
+    ``folder`` : to make the model of a rigid strip in, of which nobody has to say that it is at rest.
     """
     size = np.ptp(MODEL.nodes[:, 1])
     strip = replace(MODEL, nodes=MODEL.nodes * [1.0, width_m / size, 1.0])
+    known = strip
+    if folder is not None:
+        trimesh.Trimesh(strip.nodes, strip.triangles, process=False).export(folder / "strip.stl")
+        known = build_rigid(folder / "strip.stl", "m")
     on_edges = np.flatnonzero(np.abs(MODEL.nodes[:, 1]) > 0.49 * size)[::3]
     camera = Camera(1920, 1080, 2100.0, 2100.0, 959.5, 539.5)
     turned = rotation_exp(np.array([0.6, 0.25, 0.05])) @ np.diag([1.0, -1.0, -1.0])
@@ -311,8 +316,9 @@ def strip_at_rest(width_m, seed, aid=None):
     pixels = camera.project(pose.apply(strip.nodes[on_edges]))
     pixels += 0.5 * np.random.default_rng(seed).standard_normal(pixels.shape)
     more = {} if aid is None else {aid: seen_strip(strip, camera, pose, aid)}
-    found = register_landmarks(strip, camera, Landmarks(strip.nodes[on_edges], pixels), at_rest=True, **more)
-    line, of_rotation = turned[:, 0], slice(len(MODEL.parameters), len(MODEL.parameters) + 3)
+    given, d = Landmarks(strip.nodes[on_edges], pixels), len(known.parameters)
+    found = register_landmarks(known, camera, given, at_rest=folder is None, **more)
+    line, of_rotation = turned[:, 0], slice(d, d + 3)
     turn = rotation_log(found.state.camera_from_object.rotation @ turned.T) @ line
     return turn, np.sqrt(line @ found.covariance[of_rotation, of_rotation] @ line)
 
@@ -364,6 +370,14 @@ def test_the_deviation_holds_the_mirrored_tilt_where_depth_or_outline_correct_th
     turn, deviation = strip_at_rest(width_m, seed, aid)
     assert abs(turn) < 3.0 * deviation
     assert 0.2 < deviation < 1.3
+
+
+def test_the_deviation_holds_the_mirrored_tilt_of_a_rigid_object_too(tmp_path):
+    """It has no parameters, and is at rest whether that is said or not."""
+    turn, deviation = strip_at_rest(1.6e-3, 47, "depth", tmp_path)
+    assert abs(turn) > 1.0
+    assert abs(turn) < 3.0 * deviation
+    assert deviation < 1.3
 
 
 def test_an_object_so_narrow_that_clicks_do_not_tell_its_turn_is_refused():

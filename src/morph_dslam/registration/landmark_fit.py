@@ -66,6 +66,11 @@ class LandmarkFit:
     click_px: float
 
     @property
+    def is_shape_known(self) -> bool:
+        """Whether the pose alone is unknown: of an object at rest, or a rigid one."""
+        return _is_shape_known(self.estimator)
+
+    @property
     def best(self) -> Estimate:
         return self.plausible[0]
 
@@ -73,7 +78,7 @@ class LandmarkFit:
     def covariance(self) -> Array:
         """(d + 6, d + 6); a few landmarks that happen to fit well, or that a wrong model fits, are not exact for it."""
         covariance = self.best.covariance * as_set(self.best, self.click_px)
-        if _is_shape_known(self.estimator):
+        if self.is_shape_known:
             best, variance = self.best, max(self.click_px, self.best.sigma_px) ** 2
             rises = [(other.state, 2.0 * (other.cost - best.cost) / variance) for other in self.plausible[1:]]
             covariance[-6:, -6:] += spread_of_turns(self.estimator.model, best.state, rises)
@@ -86,7 +91,7 @@ class LandmarkFit:
         These look the same, and what corrects landmarks may tell them apart.
         """
         model, best, states = self.estimator.model, self.best.state, [one.state for one in self.plausible[1:]]
-        turned = turned_states(model, best, states) if _is_shape_known(self.estimator) else []
+        turned = turned_states(model, best, states) if self.is_shape_known else []
         return (*distinct_states(model, best, states), *(states[row] for row in turned))
 
     @property
@@ -184,7 +189,7 @@ def fit_landmarks(
     plausible = plausible_minima(found, click_px, estimator.box.n_unknowns)
     _check_residual(estimator, landmarks, plausible[0])
     fit = LandmarkFit(estimator, landmarks, plausible, click_px)
-    if _is_shape_known(estimator):
+    if fit.is_shape_known:
         _check_beside_line(fit)
     return fit
 

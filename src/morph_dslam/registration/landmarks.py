@@ -145,7 +145,7 @@ def register_landmarks(
     placed = _Placed(fit.best, fit.covariance, fit.measured, alternatives)
     moved = fit.not_at_rest([] if near is not None else shape_starts(model)) if at_rest else None
     if depth is not None:
-        placed = _by_depth(fit, camera.checked_depth(depth, "the depth"), (depth_sigma, depth_scale_std), at_rest)
+        placed = _by_depth(fit, camera.checked_depth(depth, "the depth"), (depth_sigma, depth_scale_std))
     elif image is not None:
         placed = _by_outline(fit, placed, undistorted_grey(camera, image))
     facts = _facts(fit, len(alternatives)) | placed.facts
@@ -210,7 +210,7 @@ def _precise(fit: LandmarkFit) -> Estimator:
     return estimator
 
 
-def _by_depth(fit: LandmarkFit, depth: NDArray[np.float32], deviations: tuple[float, float], at_rest: bool) -> _Placed:
+def _by_depth(fit: LandmarkFit, depth: NDArray[np.float32], deviations: tuple[float, float]) -> _Placed:
     """The object along the sight line by the frame's depth (h, w), with its deviations at 1 m and of its scale."""
     # How well the landmarks fit shows how carefully they were set. A few that happen to fit well are no more exact.
     sigma = max(fit.best.sigma_px, fit.click_px) if np.isfinite(fit.best.sigma_px) else UNKNOWN_PX
@@ -219,7 +219,7 @@ def _by_depth(fit: LandmarkFit, depth: NDArray[np.float32], deviations: tuple[fl
     best = found.estimate
     alternatives = distinct_states(precise.model, best.state, [other.estimate.state for other in others])
     covariance = best.covariance
-    if at_rest:
+    if fit.is_shape_known:
         covariance = without_parameters(covariance)
         rises = [(other.estimate.state, 2.0 * (other.cost - found.cost)) for other in others]
         covariance[-6:, -6:] += spread_of_turns(precise.model, best.state, rises)
