@@ -265,6 +265,24 @@ def test_a_build_replaces_no_file_that_its_study_names(kind, name, with_inputs: 
     assert contents(with_inputs) == before
 
 
+def test_a_build_names_the_row_of_a_table_that_has_no_file(with_inputs: Path, monkeypatch, refused) -> None:
+    monkeypatch.chdir(with_inputs)
+    Path("study.toml").write_text(NAMING["external"])
+    Path("table.csv").write_text("file,force [N]\nsolutions/1.vtu,1\n,2\n")
+    assert "table.csv, line 3: the cell of 'file' is empty" in refused("build", "study.toml", "-o", "model.morph")
+
+
+def test_a_file_beside_a_solution_that_keeps_nothing_there_is_no_input(with_inputs: Path, monkeypatch, refused) -> None:
+    """XDMF files keep their numbers in a file .h5 beside them, others do not: the build goes on to the solutions."""
+    monkeypatch.chdir(with_inputs)
+    Path("study.toml").write_text(NAMING["external"])
+    Path("solutions").mkdir()
+    for own in ("solutions/1.vtu", "solutions/1.h5"):
+        Path(own).write_text("mine")
+    Path("table.csv").write_text("file,force [N]\n" + "".join(f"solutions/{k}.vtu,{k}\n" for k in (1, 2, 3, 4, 5, 6)))
+    assert "cannot read the solution solutions/1.vtu" in refused("build", "study.toml", "-o", "solutions/1.h5")
+
+
 POSE = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 620]\n"
 
 

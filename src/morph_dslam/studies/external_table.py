@@ -36,7 +36,7 @@ class SolutionTable:
     ------
     StudyError
         If the file cannot be read, has no rows or no column ``file``, a header twice, a row with more or fewer
-        cells than headers, or one solution twice.
+        cells than headers or without a file, or one solution twice.
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,6 +63,10 @@ class SolutionTable:
         lines: dict[tuple[str | None, str | None], int] = {}
         for line, row in zip(self.lines, self.rows, strict=True):
             solution = (row["file"], row.get("step"))
+            if not row["file"]:
+                raise StudyError(
+                    f"{self.path}, line {line}: the cell of 'file' is empty; name the solution's file there"
+                )
             if solution in lines:
                 raise StudyError(
                     f"{self.path}, line {line}: '{solution[0]}' is in line {lines[solution]} already; list each "

@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from morph_dslam.errors import StudyError
+from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.sections import explain
 from morph_dslam.io.text import read_toml
 from morph_dslam.meshing.mesh_files import load_mesh
@@ -80,7 +81,8 @@ def input_files(study: Study) -> list[Path]:
     if isinstance(study, ExternalStudy):
         table = SolutionTable(study.external.table)
         solutions = [table.path.parent / row["file"] for row in table.rows]
-        files += [*solutions, *(path.with_suffix(".h5") for path in solutions)]  # what XDMF files keep beside them
+        beside = [path.with_suffix(".h5") for path in solutions if file_kind(path) == ".xdmf"]
+        files += [*solutions, *beside]
     return files
 
 
