@@ -6,6 +6,7 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import morph_dslam as md
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import SolverError
 from morph_dslam.evaluation.model_summary import error_facts, summarise_model
-from morph_dslam.mechanics.solid import SolidOptions
+from morph_dslam.mechanics.solid import SolidOptions, SolidProblem
 from morph_dslam.mechanics.solvers.continuation import advance, loaded_state
 from morph_dslam.studies import discretisation
 from morph_dslam.studies.build import certified_model
@@ -140,22 +141,35 @@ def test_what_third_order_costs_too_much_for_is_compared_with_second(
     assert entry["method"] == "displacements of order 2 on the same cells"
 
 
+@pytest.mark.parametrize("how", ["no solution", "no time", "another branch"])
 def test_where_third_order_does_not_converge_second_order_is_compared_and_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     """In the most strained of two states, against both orders solved from rest to the end."""
     study = asking_for(short_bar([1, 1, 3], "hex8"), 2)
     snapshots = take_snapshots(study, tmp_path)
     model, solve = certified_model(snapshots, study.reduction, study.name), HigherOrder.solve
-    most = max(snapshot.coordinates[0] for snapshot in snapshots.held_out)
+    most, unstable, tangent = max(s.coordinates[0] for s in snapshots.held_out), list[Any](), SolidProblem.linearise
 
     def failing(self: HigherOrder, dofs: Any, mu: Any, in_time: Any) -> Any:
+        found = solve(self, dofs, mu, in_time)
         if self.problem.displacements.order == 3 and mu[0] == most:
-            raise SolverError("finer elements do not converge")
-        return solve(self, dofs, mu, in_time)
+            if how == "no solution":
+                raise SolverError("finer elements do not converge")
+            if how == "no time":
+                raise OutOfTime
+            unstable.append(found.dofs)
+            return replace(found, negative_pivots=1)
+        return found
 
+    def linearise(self: SolidProblem, x: Any, mu: Any, *others: Any) -> Any:
+        is_unstable = any(x is each for each in unstable)
+        return SimpleNamespace(negative_pivots=1) if is_unstable else tangent(self, x, mu, *others)
+
+    monkeypatch.setattr(SolidProblem, "linearise", linearise)
     monkeypatch.setattr(HigherOrder, "solve", failing)
     entry = discretisation_errors(study, snapshots, model, 0.0)
+    assert bool(unstable) == (how == "another branch")
     assert entry["method"].startswith("displacements of order 3 on the same cells, of order 2 in 1 of 2 states")
     assert "left_out" not in entry
     assert most in [state[0] for state in entry["coordinates"]]

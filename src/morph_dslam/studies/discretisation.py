@@ -176,7 +176,6 @@ def _estimate(
 
     def solve_again(index: int, in_time: Callable[[], bool]) -> Snapshot:
         step, found = _highest(steps, kept[index], in_time)
-        _check_same_branch(step.problem, found, int(kept[index]["pivots"]))
         snapshot, reached[index] = _snapshot(step.problem, found), step
         return replace(snapshot, outputs=snapshot.outputs | step.reactions_in_balance(found))
 
@@ -186,7 +185,8 @@ def _estimate(
     figures = _figures(model, snapshots, sweep.problem, finest, solved)
     if lower := [order for order in orders if order < max(orders)]:
         figures["method"] += (
-            f", of order {lower[0]} in {len(lower)} of {len(orders)} states, where these do not converge"
+            f", of order {lower[0]} in {len(lower)} of {len(orders)} states, where these do not converge in time on "
+            "the same branch"
         )
     return figures | left_out
 
@@ -194,18 +194,20 @@ def _estimate(
 def _highest(
     steps: Sequence[HigherOrder], state: dict[str, Array], in_time: Callable[[], bool]
 ) -> tuple[HigherOrder, State]:
-    """The last of the ``steps`` from one of the study's states that converges, and what it finds.
+    """The last of the ``steps`` from one of the study's states that converges on its branch, and what it finds.
 
-    Raises OutOfTime, and SolverError where none converges.
+    Raises OutOfTime or SolverError where none does.
     """
     found: list[State] = []
     for step in steps:
         try:
-            found.append(step.solve(found[-1].dofs if found else state["dofs"], state["mu"], in_time))
-        except SolverError:
+            next_one = step.solve(found[-1].dofs if found else state["dofs"], state["mu"], in_time)
+            _check_same_branch(step.problem, next_one, int(state["pivots"]))
+        except (OutOfTime, SolverError):
             if not found:
                 raise
             break  # of the states that strain a body most, more must not be left out than need be
+        found.append(next_one)
     return steps[len(found) - 1], found[-1]
 
 
