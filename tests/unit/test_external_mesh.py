@@ -64,7 +64,7 @@ def test_cells_that_cannot_be_read_are_refused_and_points_alone_are_read(tmp_pat
         "</Cells></Piece></UnstructuredGrid></VTKFile>"
     )
     path.write_text(path.read_text().replace("<DataArray type", '<DataArray format="ascii" type'))
-    with pytest.raises(StudyError, match="cells that are not known" if number == 11 else "15 nodes"):
+    with pytest.raises(StudyError, match="save hexahedra" if number == 11 else "save prisms of 18 or 6"):
         read_solution(path)
     if number == 11:
         assert read_solution(path, whole=False).points == pytest.approx(mesh.nodes)
@@ -99,12 +99,50 @@ def test_voxels_are_refused_and_polylines_left_out_at_every_width_of_the_termina
     monkeypatch.setenv("COLUMNS", str(columns))
     path = tmp_path / f"solution.{kind[-3:]}"
     write_with_types(path, kind, [12, 11])
-    with pytest.raises(StudyError, match="cells that are not known"):
+    with pytest.raises(StudyError, match="holds voxels, which cannot be read: save hexahedra in their place"):
         read_solution(path)
-    with pytest.raises(StudyError, match="cells that are not known"):
+    with pytest.raises(StudyError, match="holds voxels, which cannot be read: save hexahedra in their place"):
         load_mesh(path, "mm")
     write_with_types(path, kind, [12, 4])
     capfd.readouterr()  # meshio warns of text files that it writes
     for mesh in (mesh_of(read_solution(path), "mm", path), load_mesh(path, "mm")):
         assert cell_volumes(mesh) == pytest.approx([np.prod(SIZE) / 2])
     assert not any(capfd.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("version", "number", "said"),
+    [
+        ("3.0", 4, "holds polylines, which cannot be read: save lines"),
+        ("3.0", 8, "holds pixels, which cannot be read: save quadrilaterals"),
+        ("5.1", 8, "holds pixels, which cannot be read: save quadrilaterals"),
+        ("3.0", 11, "holds voxels, which cannot be read: save hexahedra"),
+        ("3.0", 99, "holds cells of VTK's type 99, which cannot be read"),
+    ],
+)
+def test_cells_that_end_meshio_in_an_error_are_named(tmp_path, version, number, said):
+    """Beside a hexahedron, in VTK's legacy format."""
+    path, corners = tmp_path / "solution.vtk", 8 if number == 11 else 4
+    points = "\n".join(f"{x} {y} {z}" for z in (0, 1) for y in (0, 1) for x in (0, 1))
+    solid, other = "0 1 3 2 4 5 7 6", " ".join(map(str, range(corners)))
+    cells = f"CELLS 2 {10 + corners}\n8 {solid}\n{corners} {other}"
+    if version == "5.1":
+        offsets = f"OFFSETS vtktypeint64\n0 8 {8 + corners}"
+        cells = f"CELLS 3 {8 + corners}\n{offsets}\nCONNECTIVITY vtktypeint64\n{solid} {other}"
+    path.write_text(
+        f"# vtk DataFile Version {version}\nname\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 8 double\n{points}\n"
+        f"{cells}\nCELL_TYPES 2\n12\n{number}\n"
+    )
+    with pytest.raises(StudyError, match=said):
+        read_solution(path)
+    with pytest.raises(StudyError, match=said):
+        load_mesh(path, "mm")
+
+
+def test_prisms_of_15_nodes_in_xdmf_are_named(tmp_path):
+    content = meshio.Mesh(np.random.default_rng(0).uniform(size=(18, 3)), [("wedge18", np.arange(18)[None])])
+    meshio.xdmf.write(tmp_path / "s.xdmf", content, data_format="XML")
+    text = (tmp_path / "s.xdmf").read_text()
+    (tmp_path / "s.xdmf").write_text(text.replace("Wedge_18", "Wedge_15"))
+    with pytest.raises(StudyError, match="holds prisms of 15 nodes, which cannot be read: save prisms of 18 or 6"):
+        read_solution(tmp_path / "s.xdmf")

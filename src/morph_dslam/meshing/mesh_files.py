@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
-from morph_dslam.meshing.left_out_cells import leaves_out_cells
+from morph_dslam.meshing.left_out_cells import leaves_out_cells, unread_cells
 from morph_dslam.meshing.mesh_checks import check_corners
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_found_surfaces
@@ -237,11 +237,14 @@ def _read(path: Path) -> Any:
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
         raise _damaged(path, error) from error
     if lacks_cells:  # voxels, say
-        raise StudyError(f"{path} holds cells that are not known; use {', '.join(_CELLS)}")
+        known = f"cells that are not known; use {', '.join(_CELLS)}"
+        raise StudyError(f"{path} holds {unread_cells(path) or known}")
     return content
 
 
 def _damaged(path: Path, error: Exception) -> StudyError:
+    if unread := unread_cells(path, error):
+        return StudyError(f"{path} holds {unread}")
     if file_kind(path) == ".msh" and path.read_bytes()[:1] == b"(":
         return StudyError(
             f"{path} is an ANSYS mesh file, which ends in .msh too: save it as Gmsh's, from meshio with "

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.meshing.left_out_cells import leaves_out_cells
+from morph_dslam.meshing.left_out_cells import leaves_out_cells, unread_cells
 
 Array = NDArray[np.float64]
 #: Of meshio, by what the file is: `meshio.read` itself ends the program where a file is damaged.
@@ -26,7 +26,8 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
     """A file's mesh and point data; of an XDMF series those of one step.
 
     Raises StudyError if it is missing, damaged or of another kind, the step is no number from 0 on, or, where it must
-    be ``whole``, it has cells that meshio does not know and leaves out, such as voxels; polylines beside solids may be.
+    be ``whole``, it has cells that meshio does not know and leaves out, such as voxels; polylines beside solids may be,
+    save in legacy VTK files older than version 5.1, which meshio refuses then.
     """
     if step is not None and not step.isdecimal():
         raise StudyError(f"step '{step}' of {path} is no whole number from 0 on")
@@ -38,7 +39,7 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
             with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
                 content = read(str(path))
             if whole and leaves_out_cells(path, content):
-                raise StudyError(f"{path} holds cells that are not known, such as voxels: save them as hexahedra")
+                raise StudyError(f"{path} holds {unread_cells(path) or 'cells that are not known'}")
             return content
         with meshio.xdmf.TimeSeriesReader(path) as reader:
             points, cells = reader.read_points_cells()
@@ -46,13 +47,9 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
             return meshio.Mesh(np.asarray(points), cells, point_data=point_data)
     except StudyError:
         raise
-    except KeyError as error:
-        if "wedge15" in error.args:
-            raise StudyError(
-                f"{path} holds prisms of 15 nodes, which cannot be read: save them with 18 or 6"
-            ) from error
-        raise StudyError(f"cannot read the solution {path}: {error}") from error
     except Exception as error:  # meshio raises whatever its parsers meet
+        if unread := unread_cells(path, error):
+            raise StudyError(f"{path} holds {unread}") from error
         raise StudyError(f"cannot read the solution {path}: {error}") from error
 
 
