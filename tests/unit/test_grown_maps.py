@@ -195,6 +195,14 @@ def test_a_map_that_never_grew_and_lacks_a_keyframe_of_the_registration_is_anoth
         load_registration(tmp_path / "registration.json", model, other)
 
 
+def test_a_map_that_agrees_in_the_reference_keyframe_alone_is_another_one(tmp_path):
+    model, numbers = bent_sheet_model(8, 6), (0, 7, 13, 27)
+    registered(model, map_of(*map(keyframe, numbers, (0.0, 0.02, 0.05, 0.08)))).save(tmp_path / "registration.json")
+    other = Scene(CAMERA, map_of(*map(keyframe, numbers, (0.5, 0.02, 0.45, 0.08))), NO_PATH)
+    with pytest.raises(MapError, match="400 mm and 0 deg from where the registration has it in keyframe 13"):
+        load_registration(tmp_path / "registration.json", model, other)
+
+
 def test_landmarks_in_a_number_of_two_recordings_are_refused():
     rigid_map = map_of(keyframe(0, 0.0), keyframe(20, 0.2))
     path = Trajectory(np.arange(3.0), np.linalg.inv(np.array([at(x) for x in (0.0, 0.1, 1.5)])), np.array([0, 10, 20]))
