@@ -33,22 +33,24 @@ def rigid_estimator():
 
 
 def seen_frame(rng, distance, tilt):
-    """The truth of a frame, its points, and what finds the minimum of its cost from a start."""
+    """The truth of a frame, its points, its cost, and what finds that cost's minimum from a start."""
     points, estimator = bound_points(MODEL, COUNT, rng), rigid_estimator()
     turn = rotation_exp(np.array([0.05, tilt, 0.1])) @ UPRIGHT
     truth = State(FLAT, RigidTransform(turn, np.array([0.1, -0.05, distance])))
     pixels = CAMERA.project(points.in_camera(truth)) + NOISE_PX * rng.standard_normal((COUNT, 2))
-    return truth, points, lambda start: estimator.minimum(points, pixels, np.ones(COUNT), start)
+    measured = points, pixels, np.ones(COUNT)
+    of_cost = lambda state: estimator.evaluate(*measured, state)[0], lambda start: estimator.minimum(*measured, start)
+    return truth, points, of_cost
 
 
 def tilts(rng, distance, tilt):
     """The truth, the estimate from one of both tilts at random, and the other one."""
-    truth, points, minimum = seen_frame(rng, distance, tilt)
+    truth, points, (cost, minimum) = seen_frame(rng, distance, tilt)
     start = truth
     if rng.random() < 0.5:
         start = replace(truth, camera_from_object=mirrored_tilt(MODEL.nodes, truth.camera_from_object))
     found = minimum(start).state
-    return truth, found, find_other_tilt(minimum, points, found, 2 * COUNT, 1.0)
+    return truth, found, find_other_tilt(cost, minimum, points, found, 2 * COUNT, 1.0)
 
 
 def angle(one, other):
@@ -164,14 +166,34 @@ def test_a_tilt_that_is_left_is_the_other_one_of_what_is_taken():
     """As it is found from there."""
     rng = np.random.default_rng(4)
     for _ in range(10):
-        truth, points, minimum = seen_frame(rng, 7.0, rng.uniform(0.3, 0.6))
+        truth, points, (cost, minimum) = seen_frame(rng, 7.0, rng.uniform(0.3, 0.6))
         here = minimum(truth).state
-        other = find_other_tilt(minimum, points, here, 2 * COUNT, 1.0)
-        from_there, left = find_other_tilt(minimum, points, other.state, 2 * COUNT, 1.0), other.left(here)
+        other = find_other_tilt(cost, minimum, points, here, 2 * COUNT, 1.0)
+        from_there, left = find_other_tilt(cost, minimum, points, other.state, 2 * COUNT, 1.0), other.left(here)
         assert left.ratio == pytest.approx(from_there.ratio, abs=1e-3)
         assert left.probability == pytest.approx(1.0 - other.probability)
         np.testing.assert_allclose(left.apart, from_there.apart, atol=1e-3)
         assert angle(left.state, from_there.state) < 1e-3
+
+
+@pytest.mark.parametrize(("distance", "n_minima"), [(1.0, 1), (9.0, 2)])
+def test_a_tilt_that_is_clearly_wrong_takes_one_minimisation(distance, n_minima):
+    """Beside the true state's own cost, which is no less than that of the minimum near it; an open one takes both."""
+    rng, starts = np.random.default_rng(5), []
+    for _ in range(10):
+        truth, points, (cost, minimum) = seen_frame(rng, distance, rng.uniform(0.4, 0.6))
+
+        def counted(start, minimum=minimum):
+            starts.append(start)
+            return minimum(start)
+
+        other = find_other_tilt(cost, counted, points, truth, 2 * COUNT, 1.0)
+        assert other.is_excluded == (n_minima == 1)
+        # No likelier than both minima say.
+        difference = minimum(other.state).cost - minimum(truth).cost
+        freedom = 2 * COUNT - 9
+        assert other.ratio <= 2.0 * difference / (2.0 * minimum(truth).cost / freedom) * (1.0 + 1e-6)
+    assert len(starts) == 10 * n_minima
 
 
 @pytest.mark.parametrize("tilt", [0.1, 0.15])

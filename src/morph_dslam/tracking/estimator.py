@@ -360,11 +360,17 @@ class Estimator:
 
     def restated(self, measured: Observations, estimate: Estimate, prior: Prior | None = None) -> Estimate:
         """An estimate with deviations by its residuals, and by what is known now, not when it was made."""
-        cost, hessian, _, _ = self.evaluate(
-            measured.points, measured.pixels, measured.weights, estimate.state, measured.normals, prior, measured.depths
-        )
+        cost, hessian, _, _ = self.evaluated(measured, estimate.state, prior)
         minimum = Minimum(estimate.state, cost, hessian, estimate.residuals, estimate.iterations, estimate.converged)
         return self.finished(minimum, measured.weights, measured.numbers)
+
+    def evaluated(
+        self, measured: Observations, state: State, prior: Prior | None = None
+    ) -> tuple[float, Array, Array, Array]:
+        """`evaluate` of all that was measured in a frame."""
+        return self.evaluate(
+            measured.points, measured.pixels, measured.weights, state, measured.normals, prior, measured.depths
+        )
 
     def fitted(self, measured: Observations, start: State, prior: Prior | None = None) -> Minimum:
         """`minimum` of all that was measured in a frame."""

@@ -216,6 +216,7 @@ class FrameEstimation:
         for measured in self._few_and_all(attempt):
             points, n_numbers = measured[0], 2 * int(attempt.measurement.valid.sum())
             other = find_other_tilt(
+                lambda state, measured=measured: self._cost(measured, state, None),
                 lambda start, measured=measured: self._scout.minimum(*measured, start),
                 points, attempt.estimate.state, n_numbers, self._reference.redundancy,
             )  # fmt: skip
@@ -237,6 +238,7 @@ class FrameEstimation:
         measured = self.measured(replace(attempt, correction=None), correlated=False)
         n_numbers = int(measured.numbers[measured.weights > 0.0].sum())
         other = find_other_tilt(
+            lambda state: self._scout.evaluated(measured, state)[0],
             lambda start: self._scout.fitted(measured, start),
             self._reference.points, attempt.estimate.state, n_numbers, self._reference.redundancy,
         )  # fmt: skip

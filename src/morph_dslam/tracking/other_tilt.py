@@ -68,13 +68,19 @@ class OtherTilt:
 
 
 def find_other_tilt(
-    minimum: Callable[[State], Minimum], points: BoundPoints, state: State, n_numbers: int, redundancy: float
+    cost: Callable[[State], float],
+    minimum: Callable[[State], Minimum],
+    points: BoundPoints,
+    state: State,
+    n_numbers: int,
+    redundancy: float,
 ) -> OtherTilt:
-    """The minimum in the mirrored tilt, against that at a state.
+    """The minimum in the mirrored tilt, against that at a state; of one that is excluded at least so much likelier.
 
     Parameters
     ----------
-    minimum : of a frame's cost, squared pixels, from a start.
+    cost : of a frame at a state, squared pixels.
+    minimum : of that cost from a start, no more than it is there.
     points : (p,) of the object.
     state : at or near the minimum where the frame has the object.
     n_numbers : that were measured.
@@ -82,13 +88,19 @@ def find_other_tilt(
     """
     positions = points.rest + points.field.value(state.parameters)
     pose = mirrored_tilt(positions, state.camera_from_object)
-    here, there = minimum(state), minimum(State(state.parameters, pose))
-    least = max(min(here.cost, there.cost), 0.0)
-    freedom = max(n_numbers - len(state.parameters) - 6, 1)
-    variance = redundancy * max(2.0 * least / freedom, LEAST_NOISE_PX**2)
+    there, freedom = minimum(State(state.parameters, pose)), max(n_numbers - len(state.parameters) - 6, 1)
     turned = pose_increment(state.camera_from_object, there.state.camera_from_object)
     apart = np.concatenate([there.state.parameters - state.parameters, turned])
-    return OtherTilt(there.state, apart, 2.0 * (there.cost - here.cost) / variance)
+
+    def against(here: float) -> OtherTilt:
+        least = max(min(here, there.cost), 0.0)
+        variance = redundancy * max(2.0 * least / freedom, LEAST_NOISE_PX**2)
+        return OtherTilt(there.state, apart, 2.0 * (there.cost - here) / variance)
+
+    # The smaller the cost here, the less likely is the other tilt: one that is excluded already need not be compared
+    # with the minimum here, which takes as long as that there.
+    other = against(cost(state))
+    return other if other.is_excluded else against(minimum(state).cost)
 
 
 def mirrored_tilt(points: Array, pose: RigidTransform) -> RigidTransform:
