@@ -93,8 +93,12 @@ def test_mixed_functions_are_the_linear_combinations_of_the_old(form):
 
 @every_format
 def test_a_wrong_number_of_parameters_is_refused(form):
+    functions, mu = make_functions(form), np.array([0.1, 0.2, 0.3])
     with pytest.raises(ValueError, match="3 parameters"):
-        make_functions(form).evaluate([0.1, 0.2])
+        functions.evaluate(mu[:2])
+    functions.evaluate(mu)
+    with pytest.raises(ValueError, match="3 parameters"):  # the same numbers as those of the state that is kept
+        functions.evaluate(mu[None])
 
 
 def test_arrays_that_do_not_fit_are_refused():

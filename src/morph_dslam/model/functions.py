@@ -69,11 +69,11 @@ class Functions(ABC):
             If ``mu`` has another shape: compiled code would read beyond the arrays.
         """
         mu = np.ascontiguousarray(mu, dtype=np.float64)
-        if mu.shape != (self.dimension,):
-            raise ValueError(f"{self.dimension} parameters are needed, not an array of shape {mu.shape}")
-        last, key = self._last, mu.tobytes()
+        last, key = self._last, (mu.shape, mu.tobytes())
         known = last.get(key)
         if known is None:
+            if mu.shape != (self.dimension,):
+                raise ValueError(f"{self.dimension} parameters are needed, not an array of shape {mu.shape}")
             known = self._compiled(mu)
             if len(last) >= KEPT:
                 last.clear()
@@ -81,8 +81,8 @@ class Functions(ABC):
         return known.copy()
 
     @cached_property
-    def _last(self) -> dict[bytes, Array]:
-        """The rows of the last parameters, by their bytes; emptied at once, so that threads need not take turns."""
+    def _last(self) -> dict[tuple[tuple[int, ...], bytes], Array]:
+        """The rows of the last parameters, by shape and bytes; emptied at once, so that threads need not take turns."""
         return {}
 
     def evaluate(self, mu: ArrayLike) -> tuple[Array, Array]:
@@ -113,17 +113,18 @@ def _fill_products(tables, degrees, first, end, products, chosen):
     first, end : where the group's terms begin and end.
     products, chosen : (1 + d, n), to be filled as far as there are terms, and (n,) for work.
     """
-    products[:, : end - first] = 1.0
+    # After k factors there are the first 1 + k rows.
+    products[0, : end - first] = 1.0
     for k in range(len(degrees)):
-        values, slopes, of_k, line = tables[k, 0], tables[k, 1], degrees[k, first:end], products[k + 1]
+        values, slopes, of_k = tables[k, 0], tables[k, 1], degrees[k, first:end]
+        whole, line = products[0], products[k + 1]
         for t in range(end - first):
             chosen[t] = values[of_k[t]]
-            line[t] *= slopes[of_k[t]]
-        for row in range(len(products)):
-            if row != k + 1:
-                line = products[row]
-                for t in range(end - first):
-                    line[t] *= chosen[t]
+            line[t] = whole[t] * slopes[of_k[t]]
+        for row in range(k + 1):
+            line = products[row]
+            for t in range(end - first):
+                line[t] *= chosen[t]
 
 
 @njit(cache=True, nogil=True)
