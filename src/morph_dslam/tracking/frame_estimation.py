@@ -92,8 +92,9 @@ class FrameEstimation:
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""
-        weights = followed.valid.astype(float)
-        return self._scout.minimum(self._reference.points, followed.pixels, weights, start, prior=prior).state
+        rows = np.flatnonzero(followed.valid)
+        points, every = self._reference.points.take(rows), np.ones(len(rows))
+        return self._scout.minimum(points, followed.pixels[rows], every, start, prior=prior).state
 
     def correct(self, picture: Image, state: State, offsets: Array | None, prior: Prior | None) -> PoseHypothesis:
         """Measure against the reference view rendered in ``state`` and estimate from these measurements.
@@ -362,7 +363,7 @@ class FrameEstimation:
         is_first = balance.weight == 0.0
         anew = is_first and systematic is not None and balance.suppose_exact_outline(seen)
         if is_first:
-            balance.learn_texture(*self._supporting(attempt, estimate))
+            balance.learn_texture(*self._supporting(attempt, estimate.residuals))
         if is_first and not anew:
             offsets = self._estimator.camera.project(seen.points.in_camera(estimate.state)) - seen.pixels
             balance.learn_outline(seen, offsets, 0.0)
@@ -378,31 +379,27 @@ class FrameEstimation:
             agreeing = seen.weighted(balance.weight, balance.agreeing(of_outline))
             taken = self._taken(seen, found.state, self._told(attempt, found))
             balance.learn_outline(seen, of_outline, taken, anew)
-        balance.learn_texture(*self._supporting(attempt, self._finished(attempt, found)))
+        balance.learn_texture(*self._supporting(attempt, found.residuals))
         attempt, found = self._corrected(replace(attempt, outline=agreeing), found.state, systematic, self._estimator)
-        return replace(attempt, estimate=self._finished(attempt, found))
-
-    def _finished(self, attempt: PoseHypothesis, found: Minimum) -> Estimate:
-        """The estimate at a minimum of the points' and the outline's cost."""
-        together = self._with_outline(attempt)
-        return self._estimator.finished(found, together.weights, together.numbers)
+        together = self.measured(attempt, correlated=False)
+        return replace(attempt, estimate=self._estimator.finished(found, together.weights, together.numbers))
 
     def _corrected(
         self, attempt: PoseHypothesis, start: State, systematic: SystematicErrors | None, estimator: Estimator
     ) -> tuple[PoseHypothesis, Minimum]:
         """The attempt with what its outline tells of the reference's error, and the minimum then."""
-        found = estimator.fitted(self._with_outline(attempt), start, attempt.prior)
+        together = self.measured(attempt, correlated=False)
+        found = estimator.fitted(together, start, attempt.prior)
         texture, rows = self._balance.texture, slice(len(attempt.inliers))
         seen = attempt.outline
         if systematic is None or seen is None or not seen.valid.any() or np.isnan(texture.variance):
             return attempt, found
         pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights)
         correction = reference_correction(
-            self._estimator, self._with_outline(attempt), found, attempt.prior, pushed, texture.independent,
-            attempt.correction,
-        )  # fmt: skip
+            self._estimator, together, found, attempt.prior, pushed, texture.independent, attempt.correction
+        )
         attempt = replace(attempt, correction=correction)
-        return attempt, estimator.fitted(self._with_outline(attempt), found.state, attempt.prior)
+        return attempt, estimator.fitted(self.measured(attempt, correlated=False), found.state, attempt.prior)
 
     def _told(self, attempt: PoseHypothesis, found: Minimum) -> Array:
         """The Hessian (d + 6, d + 6) at a minimum, less what the reference's error takes from the points."""
@@ -458,15 +455,14 @@ class FrameEstimation:
         assert attempt is not None
         return attempt
 
-    def _supporting(self, attempt: PoseHypothesis, estimate: Estimate) -> tuple[Array, Array, float]:
-        """Pixels and residuals (p, 2) of the texture's points that support an estimate, and a number's variance."""
-        rows, n_unknowns = attempt.inliers, len(self._estimator.scale)
-        residuals = estimate.residuals[: len(rows)][rows]
-        return attempt.measurement.pixels[rows], residuals, mean_square(residuals, attempt.weights[rows], n_unknowns)
+    def _supporting(self, attempt: PoseHypothesis, residuals: Array) -> tuple[Array, Array, float]:
+        """Pixels and residuals (p, 2) of the texture's points that support an attempt, and a number's variance.
 
-    def _with_outline(self, attempt: PoseHypothesis) -> Observations:
-        """The supporting points and the outline together."""
-        return self.measured(replace(attempt, depths=None), correlated=False)
+        ``residuals`` : pixels, of all points, the texture's first.
+        """
+        rows, n_unknowns = attempt.inliers, len(self._estimator.scale)
+        residuals = residuals[: len(rows)][rows]
+        return attempt.measurement.pixels[rows], residuals, mean_square(residuals, attempt.weights[rows], n_unknowns)
 
     def _taken(self, seen: OutlineMeasurement, state: State, hessian: Array) -> float:
         """How many of the outline's numbers an estimate takes up: the trace of H^-1 H_outline.
