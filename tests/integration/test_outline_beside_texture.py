@@ -9,18 +9,16 @@ import pytest
 import morph_dslam as md
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, rotation_exp
-from morph_dslam.model import SurfacePoints
-from morph_dslam.registration.registration import Registration
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
-from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
+from morph_dslam.tracking.estimator import State
+from tests.support.clicked import clicked
 from tests.support.rendered_sequence import UPRIGHT, colours
 from tests.support.turning_block import BlockFilm
 
 CAMERA = Camera(640, 480, 800.0, 800.0, 319.5, 239.5)
 FINE = 3
 FINER = Camera(FINE * 640, FINE * 480, FINE * 800.0, FINE * 800.0, FINE * 319.5 + 1.0, FINE * 239.5 + 1.0)
-CLICK_PX, N_CLICKS = 1.0, 14
 
 
 def state(time) -> State:
@@ -49,17 +47,6 @@ class SpottedFilm(BlockFilm):
         return colours(cv2.GaussianBlur(image, (0, 0), 0.6) + noise * self.rng.standard_normal(image.shape))
 
 
-def clicked(model, there, rng) -> Registration:
-    """The block in the state that clicks on its nodes give, with the covariance that their deviation gives it."""
-    chosen = rng.choice(len(model.triangles), N_CLICKS, replace=False)
-    points = BoundPoints.from_surface(model, SurfacePoints(chosen, np.tile([1.0, 0.0, 0.0], (N_CLICKS, 1))))
-    pixels = CAMERA.project(points.in_camera(there)) + CLICK_PX * rng.standard_normal((N_CLICKS, 2))
-    estimator, weights = Estimator(model, CAMERA), np.ones(N_CLICKS)
-    found = estimator.estimate(points, pixels, weights, there)
-    hessian = estimator.evaluate(points, pixels, weights, found.state)[1]
-    return Registration(model, found.state, CLICK_PX**2 * np.linalg.inv(hessian))
-
-
 def errors(film, known, times, **options):
     """Errors (f, 2) of both parameters over half of their ranges, and what is stated of them."""
     options = md.TrackerOptions(least_inliers=16, new_views=False, **options)
@@ -76,7 +63,7 @@ def errors(film, known, times, **options):
 def test_an_outline_makes_good_what_clicks_were_off_by():
     """The clicks have the bend off by a tenth of its range; the outline tells it a hundred times as exactly."""
     film = SpottedFilm(60, 3)
-    known = clicked(film.model, state(0.0), np.random.default_rng(3))
+    known = clicked(film.model, CAMERA, state(0.0), np.random.default_rng(3))
     half = 0.5 * (film.model.upper - film.model.lower)
     by_clicks = np.abs(known.state.parameters - state(0.0).parameters) / half
     off, stated = errors(film, known, (0.0, 0.1), use_outline=True)
@@ -95,7 +82,7 @@ def test_texture_beside_an_outline_does_no_harm(spots):
     for seed in range(4):
         for name, rows in found.items():
             film = SpottedFilm(spots, seed)
-            known = clicked(film.model, state(0.0), np.random.default_rng(seed))
+            known = clicked(film.model, CAMERA, state(0.0), np.random.default_rng(seed))
             off, stated = errors(film, known, np.linspace(0.0, 0.6, 6), **options[name])
             rows.append(off)
             if name == "both":

@@ -4,72 +4,86 @@ from dataclasses import replace
 
 import numpy as np
 
+from morph_dslam.tracking.binding import bind_pixels, view_of
+from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
-from morph_dslam.tracking.estimator import EstimationOptions, Estimator, Prior
-from morph_dslam.tracking.state import pose_increment
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior
+from morph_dslam.tracking.state import moved, pose_increment
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
 MODEL = bent_sheet_model(22, 16)
-TRUTH = sheet_state(0.3)
-ESTIMATOR = Estimator(MODEL, CAMERA, EstimationOptions(max_iterations=60, tolerance=1e-10))
+REFERENCE, TRUTH = sheet_state(0.1), sheet_state(0.3)
+ESTIMATOR = Estimator(MODEL, CAMERA, EstimationOptions(huber_px=50.0, max_iterations=60, tolerance=1e-10))
 #: Pixels per metre, which the depths weigh, and a scale whose effect is linear.
-WEIGHT, SCALE = 200.0, 1e-3
+WEIGHT, SCALE, WINDOW = 200.0, 1e-3, 17
 
 
-def estimated(points, depths, prior=None):
-    """By exact pixels and these depths."""
-    pixels = CAMERA.project(points.in_camera(TRUTH))
-    return ESTIMATOR.estimate(points, pixels, np.ones(len(points)), TRUTH, prior=prior, depths=depths)
+def estimated(points, true_points, factor=1.0, prior=None):
+    """By exact pixels, and depths that are so many times as large; and with nothing known of its errors."""
+    depths = PointDepths(factor * true_points.in_camera(TRUTH)[:, 2], np.full(len(points), WEIGHT), 1.0, 1e6)
+    pixels = CAMERA.project(true_points.in_camera(TRUTH))
+    found = ESTIMATOR.estimate(points, pixels, np.ones(len(points)), TRUTH, prior=prior, depths=depths)
+    return replace(found, covariance=np.zeros_like(found.covariance)), depths
 
 
 def increment(before, after):
-    turned = pose_increment(before.state.camera_from_object, after.state.camera_from_object)
-    return np.concatenate([after.state.parameters - before.state.parameters, turned])
+    turned = pose_increment(before.camera_from_object, after.camera_from_object)
+    return np.concatenate([after.parameters - before.parameters, turned]) / ESTIMATOR.scale
 
 
-def measured(points):
-    """Points with depths that are right."""
-    return PointDepths(points.in_camera(TRUTH)[:, 2], np.full(len(points), WEIGHT), 1.0, 1e6)
+def stated(errors, found, depths, **options):
+    """Deviations (d + 6,) in units of the unknowns' scale."""
+    added = errors.added(found, np.ones(depths.count), 0.0, learns=False, depths=depths, **options)
+    return np.sqrt(np.diag(added.covariance)) / ESTIMATOR.scale
 
 
-def pushed(scale, points, found, past, depths, prior=None):
-    """By the linear theory: how the estimate moves for one deviation of the scale."""
-    push = scale.push(points, found.state, past, depths)
-    pixels = CAMERA.project(points.in_camera(TRUTH))
-    hessian = ESTIMATOR.evaluate(points, pixels, np.ones(len(points)), found.state, None, prior, depths)[1]
-    return np.linalg.solve(hessian, push)
+def errors_of(points, factors, scale, state=REFERENCE):
+    return SystematicErrors(ESTIMATOR, points, [BoundPart(slice(None), state, factors)], WINDOW, scale=scale)
 
 
 def test_an_estimate_moves_with_the_scale_of_the_depths():
     points = bound_points(MODEL, 60, np.random.default_rng(0))
-    depths, nothing = measured(points), np.zeros((len(ESTIMATOR.scale),) * 2)
-    right, wrong = estimated(points, depths), estimated(points, depths.scaled(1.0 + SCALE))
-    by_theory = pushed(CommonDepthScale(SCALE, ESTIMATOR.scale), points, right, nothing, depths)
-    np.testing.assert_allclose(by_theory / ESTIMATOR.scale, increment(right, wrong) / ESTIMATOR.scale, atol=2e-5)
-    assert np.abs(increment(right, wrong)[-1]) > 0.1 * SCALE * TRUTH.camera_from_object.translation[2]
+    (right, depths), (wrong, _) = estimated(points, points), estimated(points, points, 1.0 + SCALE)
+    for factors in (None, np.zeros((9, 9))):
+        errors = errors_of(points, factors, CommonDepthScale(SCALE))
+        off = np.abs(increment(right.state, wrong.state))
+        np.testing.assert_allclose(stated(errors, right, depths), off, atol=2e-5)
+    assert off[-1] * ESTIMATOR.scale[-1] > 0.1 * SCALE * TRUTH.camera_from_object.translation[2]
 
 
 def test_it_does_not_average_out_over_frames():
     """A frame that rests on one before: the scale has moved what is known from there too, by as much as it did."""
-    points = bound_points(MODEL, 60, np.random.default_rng(0))
-    depths, nothing = measured(points), np.zeros((len(ESTIMATOR.scale),) * 2)
-    scale, d = CommonDepthScale(SCALE, ESTIMATOR.scale), len(MODEL.parameters)
-    before, moved = estimated(points, depths), estimated(points, depths.scaled(1.0 + SCALE))
-    scale.keep(pushed(scale, points, before, nothing, depths))
-    past = nothing.copy()
+    points, d = bound_points(MODEL, 60, np.random.default_rng(0)), len(MODEL.parameters)
+    errors = errors_of(points, None, CommonDepthScale(SCALE))
+    (before, depths), (off, _) = estimated(points, points), estimated(points, points, 1.0 + SCALE)
+    stated(errors, before, depths)
+    past = np.zeros((d + 6, d + 6))
     past[:d, :d] = np.diag(1e4 / ESTIMATOR.scale[:d] ** 2)
     known = Prior(before.state.parameters, past[:d, :d])
-    right = estimated(points, depths, known)
-    wrong = estimated(points, depths.scaled(1.0 + SCALE), replace(known, mean=moved.state.parameters))
-    by_theory = pushed(scale, points, right, past, depths, known)
-    np.testing.assert_allclose(by_theory / ESTIMATOR.scale, increment(right, wrong) / ESTIMATOR.scale, atol=2e-5)
+    right, _ = estimated(points, points, prior=known)
+    wrong, _ = estimated(points, points, 1.0 + SCALE, replace(known, mean=off.state.parameters))
+    by_theory = stated(errors, right, depths, past_information=past)
+    np.testing.assert_allclose(by_theory, np.abs(increment(right.state, wrong.state)), atol=2e-5)
 
 
-def test_where_the_reference_has_it_already_it_counts_once():
-    points = bound_points(MODEL, 10, np.random.default_rng(0))
-    nothing = np.zeros((len(ESTIMATOR.scale),) * 2)
-    push = CommonDepthScale(0.0, ESTIMATOR.scale).push(points, TRUTH, nothing, measured(points))
-    assert not push.any()
+def test_a_reference_found_by_depths_is_as_far_off_as_these_and_they_do_not_hold_it_against_that():
+    """Depths by which the registration is a little too far away have the object there in all frames."""
+    true_points = bound_points(MODEL, 150, np.random.default_rng(1))
+    seen, step = CAMERA.project(true_points.in_camera(REFERENCE)), np.zeros(9)
+    step[8] = SCALE * true_points.in_camera(REFERENCE)[:, 2].mean()
+    taken = moved(REFERENCE, step)
+    surface, met = bind_pixels(MODEL, CAMERA, view_of(MODEL, CAMERA, taken), seen)
+    true_points, points = true_points.take(np.flatnonzero(met)), BoundPoints.from_surface(MODEL, surface)
+    found, depths = estimated(points, true_points, 1.0 + SCALE)
+    off = np.abs(increment(TRUTH, found.state))
+    assert off[-1] * ESTIMATOR.scale[-1] > 0.8 * step[8]
+    # Other errors of the registration, a thousandth as large, make the factors as many as unknowns.
+    factors = np.column_stack([step, 1e-3 * step[8] * np.eye(9)[:, :8]])
+    by_theory = stated(errors_of(points, factors, CommonDepthScale(SCALE, True), taken), found, depths)
+    np.testing.assert_allclose(by_theory, off, atol=0.1 * off.max())
+    # As if its distance were known by something else, depths would seem to hold it.
+    assert stated(errors_of(points, factors, None, taken), found, depths)[-1] < 0.6 * off[-1]

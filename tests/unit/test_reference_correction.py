@@ -1,12 +1,14 @@
-"""The reference's error by an outline, against one least squares fit of all unknowns."""
+"""The reference's error by an outline or depths, against one least squares fit of all unknowns."""
 
 import numpy as np
 import pytest
 
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.linearization import Linearization
 from morph_dslam.tracking.reference_correction import (
     COMMON_PX,
     CorrectionCheck,
+    PushedDepths,
     PushedTexture,
     corrected,
     of_common_errors,
@@ -83,6 +85,29 @@ def test_what_the_points_still_tell_is_what_is_left_beside_unknown_error_factors
     np.testing.assert_allclose(jacobian.T @ jacobian - found.information_lost, told, rtol=1e-8, atol=1e-10)
 
 
+def test_depths_tell_of_it_what_one_fit_of_all_unknowns_does(frame):
+    """An error factor moves their residuals by what it has the depths too large, in pixels by the depths' weight."""
+    jacobian, transfer, _, _, residuals, _ = frame
+    rng, flat = np.random.default_rng(6), jacobian.reshape(-1, N_UNKNOWNS)
+    slopes, off = rng.standard_normal((N_POINTS, N_UNKNOWNS)), rng.standard_normal(N_POINTS)
+    metres, per_metre = 1e-3 * rng.standard_normal((N_POINTS, N_FACTORS)), 400.0
+    depths = PushedDepths(off, slopes, per_metre * metres, metres)
+    points = Linearization.of(jacobian, residuals, np.ones(N_POINTS), 1e3)
+    whole = flat.T @ flat + slopes.T @ slopes, flat.T @ residuals.ravel() + slopes.T @ off
+    texture = PushedTexture(points, transfer, depths)
+    found = corrected(texture, whole, SQUARED_PX, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))
+    known = np.sqrt(SQUARED_PX) * np.eye(N_FACTORS)
+    rows = np.block([[flat, flat @ transfer], [slopes, per_metre * metres], [np.zeros((N_FACTORS, N_UNKNOWNS)), known]])
+    together = np.linalg.lstsq(rows, -np.concatenate([residuals.ravel(), off, np.zeros(N_FACTORS)]))[0]
+    np.testing.assert_allclose(found.found, together[N_UNKNOWNS:], rtol=1e-8)
+    covariance = SQUARED_PX * np.linalg.inv(rows.T @ rows)[N_UNKNOWNS:, N_UNKNOWNS:]
+    np.testing.assert_allclose(found.left @ found.left, covariance, rtol=1e-8)
+    # The points of an outline, which come after the texture's, have no depths.
+    measured = PointDepths(np.full(N_POINTS + 3, 0.5), np.full(N_POINTS + 3, per_metre), SQUARED_PX, 1.0)
+    shifted = found.of_depths(measured).depths - 0.5
+    np.testing.assert_allclose(shifted, np.append(-metres @ together[N_UNKNOWNS:], np.zeros(3)), atol=1e-12)
+
+
 def test_without_an_outline_the_registration_stays_as_it_is(frame):
     """At the minimum of the points' own cost, where the outline has no points."""
     jacobian, transfer, *_ = frame
@@ -96,10 +121,11 @@ def test_without_an_outline_the_registration_stays_as_it_is(frame):
     np.testing.assert_allclose(found.left, np.eye(N_FACTORS), atol=1e-10)
 
 
-def checked(check, rng, pull_px=0.0, frames=1):
+def checked(check, rng, pull_px=0.0, frames=1, found=0.0):
     """Let a check see frames whose points an outline draws along, from where they fit, by so much and by their noise.
 
-    The points are fitted by themselves, and then again with the state off by a draw of its own covariance.
+    The points are fitted by themselves, and then again with the state off by a draw of its own covariance. The error
+    factors that make it good are ``found`` deviations from what was stated.
     """
     for _ in range(frames):
         jacobian = rng.standard_normal((2 * N_CHECKED, N_UNKNOWNS))
@@ -110,7 +136,9 @@ def checked(check, rng, pull_px=0.0, frames=1):
         pulled *= pull_px / np.sqrt(np.mean(pulled**2))
         beside = alone + pulled + jacobian @ rng.multivariate_normal(np.zeros(N_UNKNOWNS), covariance)
         shift = np.full((N_CHECKED, 2), SHIFT_PX)
-        check.learn(alone.reshape(-1, 2), beside.reshape(-1, 2), shift, np.ones(N_CHECKED), 1.0, N_UNKNOWNS)
+        factors = found * np.ones(N_FACTORS) / np.sqrt(N_FACTORS)
+        residuals = alone.reshape(-1, 2), beside.reshape(-1, 2)
+        check.learn(*residuals, shift, np.ones(N_CHECKED), 1.0, N_UNKNOWNS, factors)
     return check.is_refuted
 
 
@@ -129,6 +157,22 @@ def test_points_that_are_drawn_from_where_they_fit_refute_it():
     """By as much as their noise: the registration's error would have left them where they fit."""
     rng = np.random.default_rng(4)
     assert all(checked(CorrectionCheck(), rng, NOISE_PX) for _ in range(100))
+
+
+def test_an_error_that_the_registration_does_not_have_refutes_it():
+    """Four factors together are more than five deviations off in one registration of 20000."""
+    rng = np.random.default_rng(7)
+    assert not any(checked(CorrectionCheck(), rng, found=4.0) for _ in range(100))
+    assert all(checked(CorrectionCheck(), rng, found=5.5) for _ in range(100))
+
+
+def test_a_frame_can_do_without_a_correction_that_the_registration_does_not_allow():
+    """Before the frames have refuted it for good."""
+    residuals, weights = np.full((N_CHECKED, 2), NOISE_PX), np.ones(N_CHECKED)
+    check, asked = CorrectionCheck(), (residuals, residuals, 0.0 * residuals, weights, 1.0, N_UNKNOWNS)
+    assert all(check.learn(*asked, np.array(own)) for own in ([1.0, -1.0, 0.5, 0.0], [2.0, 0.0, 0.0, -2.0]))
+    assert not check.learn(*asked, np.array([0.0, 6.0, 0.0, 0.0]))
+    assert not check.is_refuted
 
 
 def test_clutter_that_passes_does_not_refute_it_and_what_stays_does():

@@ -17,6 +17,7 @@ from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import BoundPart
 from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, Prior, State, moved
 from morph_dslam.tracking.multi_camera import RigTracker, agreeing
 from morph_dslam.tracking.noise import RigObservations
@@ -285,7 +286,7 @@ def estimated(model, pictures, depth_weight=None):
 
 def with_errors(trackers, plain, seen, stds):
     """The covariance (9, 9) of an estimate with the errors that are known, the depths' scales with these deviations."""
-    errors = RigErrors(trackers, RIG, stds)
+    errors = RigErrors(trackers, RIG, [CommonDepthScale(std) for std in stds])
     return errors.added(plain, errors.views(plain, seen), None, [0.0] * len(RIG)).covariance
 
 

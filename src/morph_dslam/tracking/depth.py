@@ -120,7 +120,15 @@ class PointDepths:
 
     def terms(self, points: BoundPoints, state: State) -> tuple[float, Array, Array, Array]:
         """Cost, Hessian (d + 6, d + 6), gradient and residuals (p,) in pixels at a state."""
-        return linearise_depths(*points.in_state(state), self.depths, self.weights, self.huber_px)
+        residuals, slopes = self.linearised(points, state)
+        away, huber = np.abs(residuals), self.huber_px
+        weighted = huber_weights(away, huber)[:, None] * slopes
+        cost = float(np.sum(np.where(away > huber, huber * (away - 0.5 * huber), 0.5 * away**2)))
+        return cost, weighted.T @ slopes, weighted.T @ residuals, residuals
+
+    def linearised(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
+        """Residuals (p,) in pixels at a state, and their derivatives (p, d + 6); zero of points without depth."""
+        return weighted_depths(*points.in_state(state), self.depths, self.weights)
 
 
 def _plane_depth(image: NDArray[np.float32], pixels: Array) -> Array:
@@ -153,48 +161,33 @@ def _plane_depth(image: NDArray[np.float32], pixels: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def linearise_depths(functions, rotation, translation, rest, modes, depths, weights, huber):
-    """Huber cost of depth residuals, its gradient and Gauss-Newton Hessian, compiled.
+def weighted_depths(functions, rotation, translation, rest, modes, depths, weights):
+    """Residuals of depths and their derivatives, compiled.
 
     Parameters
     ----------
     functions, rotation, translation, rest, modes : as in `reprojection.linearise`.
     depths, weights : (p,) measured, metres, and pixels per metre; points of weight 0 do not count.
-    huber : residual in pixels beyond which the cost grows linearly.
 
     Returns
     -------
-    cost : sum of rho(weight * (depth of the point - measured depth)).
-    hessian, gradient : (d + 6, d + 6) and (d + 6,)
-    residuals : (p,) pixels, 0 without weight.
+    residuals : (p,) weight * (depth of the point - measured depth), pixels, 0 without weight.
+    slopes : (p, d + 6) of these.
     """
     n_points, d = rest.shape[0], functions.shape[0] - 1
     fields = combine_modes(functions, modes.reshape(modes.shape[0], 3 * n_points)).reshape(1 + d, n_points, 3)
-    size, axis = d + 6, rotation[2]
-    hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    residuals, slope = np.zeros(n_points), np.zeros(size)
-    cost = 0.0
+    axis = rotation[2]
+    residuals, slopes = np.zeros(n_points), np.zeros((n_points, d + 6))
     for j in range(n_points):
         if weights[j] == 0.0:
             continue
         p0, p1, p2 = rest[j, 0] + fields[0, j, 0], rest[j, 1] + fields[0, j, 1], rest[j, 2] + fields[0, j, 2]
-        residual = weights[j] * (axis[0] * p0 + axis[1] * p1 + axis[2] * p2 + translation[2] - depths[j])
-        residuals[j] = residual
-        length, weight = abs(residual), weights[j]
-        factor = 1.0
-        if length <= huber:
-            cost += 0.5 * length * length
-        else:
-            cost += huber * (length - 0.5 * huber)
-            factor = huber / length
+        weight = weights[j]
+        residuals[j] = weight * (axis[0] * p0 + axis[1] * p1 + axis[2] * p2 + translation[2] - depths[j])
         for k in range(d):
             s0, s1, s2 = fields[k + 1, j, 0], fields[k + 1, j, 1], fields[k + 1, j, 2]
-            slope[k] = weight * (axis[0] * s0 + axis[1] * s1 + axis[2] * s2)
-        slope[d] = weight * (rotation[1, 0] * p0 + rotation[1, 1] * p1 + rotation[1, 2] * p2)
-        slope[d + 1] = -weight * (rotation[0, 0] * p0 + rotation[0, 1] * p1 + rotation[0, 2] * p2)
-        slope[d + 5] = weight
-        for a in range(size):
-            gradient[a] += factor * slope[a] * residual
-            for b in range(size):
-                hessian[a, b] += factor * slope[a] * slope[b]
-    return cost, hessian, gradient, residuals
+            slopes[j, k] = weight * (axis[0] * s0 + axis[1] * s1 + axis[2] * s2)
+        slopes[j, d] = weight * (rotation[1, 0] * p0 + rotation[1, 1] * p1 + rotation[1, 2] * p2)
+        slopes[j, d + 1] = -weight * (rotation[0, 0] * p0 + rotation[0, 1] * p1 + rotation[0, 2] * p2)
+        slopes[j, d + 5] = weight
+    return residuals, slopes

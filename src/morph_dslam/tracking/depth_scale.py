@@ -7,10 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.tracking.depth import PointDepths
-from morph_dslam.tracking.state import BoundPoints, State
-
-Array = NDArray[np.float64]
 #: Derivatives are differences over this share of the depths.
 STEP = 1e-4
 #: That far to either side.
@@ -35,39 +31,20 @@ class DepthScale:
         return depth if self.factor == 1.0 else depth * np.float32(self.factor)
 
 
+@dataclass(frozen=True)
 class CommonDepthScale:
-    """How the scale of all depths enters the estimates of a sequence's frames, alike in all of them.
+    """How well the scale of all depths of a sequence is known, which is alike in all of its frames.
 
-    Parameters
+    Attributes
     ----------
-    std : standard deviation of the scale, a share; zero where it is in the error of the reference already.
-    scale : (d + 6,) of the unknowns, which makes them comparable.
+    std : its standard deviation, a share.
+    in_reference : whether the reference state was found by depths of the same scale, which is then off with it.
     """
 
-    def __init__(self, std: float, scale: Array) -> None:
-        self._std, self._size = std, len(scale)
-        self.forget_frames()
+    std: float = 0.0
+    in_reference: bool = False
 
-    def forget_frames(self) -> None:
-        """The next estimate does not rest on earlier ones."""
-        self._pushed = np.zeros(self._size)
-
-    def keep(self, pushed: Array) -> None:
-        """Take in how an estimate moves (d + 6,) that later ones rest on."""
-        self._pushed = pushed
-
-    def push(self, points: BoundPoints, state: State, past: Array, depths: PointDepths | None) -> Array:
-        """How one standard deviation of the scale enters a frame's gradient (d + 6,).
-
-        Parameters
-        ----------
-        points : p of the reference view.
-        state : estimated in the frame.
-        past : (d + 6, d + 6) the information of earlier frames in it.
-        depths : (p,) of the points; None where there are none.
-        """
-        push = past @ self._pushed
-        if depths is None or not self._std:
-            return push
-        larger, smaller = (depths.scaled(factor).terms(points, state)[2] for factor in (LARGER, SMALLER))
-        return push - self._std * (larger - smaller) / (2.0 * STEP)
+    @classmethod
+    def of(cls, found: DepthScale | None, std: float) -> CommonDepthScale:
+        """As the registration has found it; with this deviation where it has not."""
+        return cls(std) if found is None else cls(found.std, True)

@@ -49,6 +49,8 @@ SCOUTED = 80
 MISSED_SHARE, MOST_COMPARISONS = 0.5, 2
 #: In the first frame with an outline its noise is learnt anew so often: each time the estimate is nearer to it.
 FIRST_ROUNDS = 3
+#: By depths the reference's error is found so often in a frame, each time nearer to where it is linear.
+DEPTH_ROUNDS = 3
 #: Depths this many times as far as the points have the object are in another unit, or of another camera.
 MOST_TIMES = 1.5
 
@@ -59,7 +61,8 @@ class FrameEstimation:
     def __init__(self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions) -> None:
         self._estimator, self._reference, self._options = estimator, reference, options
         self._noise, self._balance = PointNoise(), OutlineBalance()
-        self._reference_blur, self._correction_check = ReferenceBlur(), CorrectionCheck()
+        self._reference_blur = ReferenceBlur()
+        self._outline_check, self._depth_check = CorrectionCheck(), CorrectionCheck()
         self._search = ShapeSearch(estimator.model, options.searches)
         brief = replace(options.estimation, max_iterations=10, tolerance=1e-3)
         self._scout = Estimator(estimator.model, estimator.camera, brief)
@@ -332,23 +335,42 @@ class FrameEstimation:
         ``systematic`` : of the points; the outline then also tells of the error that the reference has given them,
         unless the frames so far have shown that something else sets both apart.
         """
-        outline, check = self._reference.outline, self._correction_check
+        outline, check = self._reference.outline, self._outline_check
         if outline is None or attempt.outline_alone:
             return attempt
-        # A pose that is held has the registration's error, too: together with the points' it leaves the shape as it is.
-        if self._options.pose == "fixed" or (systematic is not None and not systematic.knows_reference):
-            systematic = None
-        if systematic is None or check.is_refuted:
+        if not self._makes_good(systematic, check):
             return self._beside(outline, picture, attempt)
-        found, rows = self._beside(outline, picture, attempt, systematic), attempt.inliers
-        if found.correction is not None:
-            alone, beside = [one.estimate.residuals[: len(rows)][rows] for one in (attempt, found)]
-            shift, weights, n_unknowns = found.correction.shift[rows], attempt.weights[rows], len(self._estimator.scale)
-            check.learn(alone, beside, shift, weights, self._reference.redundancy, n_unknowns)
+        found = self._beside(outline, picture, attempt, systematic)
+        self._is_possible(check, attempt, found)
         if check.is_refuted:
             self._balance = OutlineBalance()  # which was learnt with the correction
             found = self._beside(outline, picture, attempt)
         return found
+
+    def _makes_good(self, systematic: SystematicErrors | None, check: CorrectionCheck) -> bool:
+        """Whether what is measured beside the points may correct the reference's error.
+
+        A pose that is held has the registration's error, too: together with the points' it leaves the shape as it is.
+        """
+        is_known = systematic is not None and systematic.knows_reference
+        return is_known and self._options.pose != "fixed" and not check.is_refuted
+
+    def _is_possible(self, check: CorrectionCheck, attempt: PoseHypothesis, found: PoseHypothesis) -> bool:
+        """Whether the reference may be off by what this frame shows, and most so far do not speak against that.
+
+        Parameters
+        ----------
+        check : that takes the frame in.
+        attempt : without what corrects the points.
+        found : with it.
+        """
+        if found.correction is None:
+            return True
+        rows, before = attempt.inliers, attempt.correction
+        alone, beside = [one.estimate.residuals[: len(rows)][rows] for one in (attempt, found)]
+        shift = found.correction.shift if before is None else found.correction.shift - before.shift
+        asked = shift[rows], attempt.weights[rows], self._reference.redundancy, len(self._estimator.scale)
+        return check.learn(alone, beside, *asked, found.correction.found) and not check.is_refuted
 
     def _beside(
         self, outline: Outline, picture: Image, attempt: PoseHypothesis, systematic: SystematicErrors | None = None
@@ -381,24 +403,26 @@ class FrameEstimation:
             balance.learn_outline(seen, of_outline, taken, anew)
         balance.learn_texture(*self._supporting(attempt, found.residuals))
         attempt, found = self._corrected(replace(attempt, outline=agreeing), found.state, systematic, self._estimator)
+        return replace(attempt, estimate=self._finished(attempt, found))
+
+    def _finished(self, attempt: PoseHypothesis, found: Minimum) -> Estimate:
+        """The estimate at a minimum of the points' and the outline's cost."""
         together = self.measured(attempt, correlated=False)
-        return replace(attempt, estimate=self._estimator.finished(found, together.weights, together.numbers))
+        return self._estimator.finished(found, together.weights, together.numbers)
 
     def _corrected(
         self, attempt: PoseHypothesis, start: State, systematic: SystematicErrors | None, estimator: Estimator
     ) -> tuple[PoseHypothesis, Minimum]:
-        """The attempt with what its outline tells of the reference's error, and the minimum then."""
-        together = self.measured(attempt, correlated=False)
-        found = estimator.fitted(together, start, attempt.prior)
-        texture, rows = self._balance.texture, slice(len(attempt.inliers))
-        seen = attempt.outline
-        if systematic is None or seen is None or not seen.valid.any() or np.isnan(texture.variance):
+        """The attempt with what its outline and depths tell of the reference's error, and the minimum then."""
+        together, seen, depths = self.measured(attempt, correlated=False), attempt.outline, attempt.corrected_depths
+        found, rows = estimator.fitted(together, start, attempt.prior), slice(len(attempt.inliers))
+        squared_px = self._balance.texture.independent if depths is None else depths.squared_px
+        tells = depths is not None or (seen is not None and seen.valid.any())
+        if systematic is None or not tells or np.isnan(squared_px):
             return attempt, found
-        pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights)
-        correction = reference_correction(
-            self._estimator, together, found, attempt.prior, pushed, texture.independent, attempt.correction
-        )
-        attempt = replace(attempt, correction=correction)
+        pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights, depths)
+        asked = found, attempt.prior, pushed, squared_px, attempt.correction
+        attempt = replace(attempt, correction=reference_correction(self._estimator, together, *asked))
         return attempt, estimator.fitted(self.measured(attempt, correlated=False), found.state, attempt.prior)
 
     def _told(self, attempt: PoseHypothesis, found: Minimum) -> Array:
@@ -479,8 +503,13 @@ class FrameEstimation:
         """What an outline beside the points adds to the Hessian (d + 6, d + 6) of an attempt; None without one."""
         return None if attempt.outline is None else self._of_outline(attempt.outline, attempt.estimate.state)
 
-    def fit_depths(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
-        """Estimate with the depths of the supporting points too, if a depth camera saw them where they are."""
+    def fit_depths(
+        self, picture: Image, attempt: PoseHypothesis, systematic: SystematicErrors | None = None
+    ) -> PoseHypothesis:
+        """Estimate with the depths of the supporting points too, if a depth camera saw them where they are.
+
+        ``systematic`` : of the points, of which depths tell as in `fit_outline`.
+        """
         if not self._options.use_depth or attempt.outline_alone:
             return attempt
         if picture.depth is None:
@@ -493,6 +522,14 @@ class FrameEstimation:
         if ratio is None or not 1.0 / MOST_TIMES < ratio < MOST_TIMES:
             return replace(attempt, depth_unused=DepthNotUsed(ratio))
         attempt = replace(attempt, depths=depths.padded(len(self._reference.all_points)))
+        if self._makes_good(systematic, self._depth_check):
+            found, minimum = self._corrected(attempt, attempt.estimate.state, systematic, self._scout)
+            for _ in range(DEPTH_ROUNDS - 1):
+                found, minimum = self._corrected(found, minimum.state, systematic, self._estimator)
+            found = replace(found, estimate=self._finished(found, minimum))
+            # Nothing was learnt with the correction, so that one frame can do without.
+            if self._is_possible(self._depth_check, attempt, found):
+                return found
         seen = self.measured(attempt, correlated=False)
         return replace(attempt, estimate=self._estimator.fit(seen, attempt.estimate.state, attempt.prior))
 
@@ -529,7 +566,9 @@ class FrameEstimation:
         points, pixels, weights = self._reference.points, attempt.measurement.pixels, attempt.weights
         if attempt.correction is not None:
             pixels = pixels - attempt.correction.shift
-        normals, seen = np.zeros_like(pixels), attempt.outline
+        normals, seen, depths = np.zeros_like(pixels), attempt.outline, attempt.depths
+        if depths is not None and attempt.correction is not None:
+            depths = attempt.correction.of_depths(depths)
         correlation: Correlation = np.zeros((0, 0))
         if correlated:
             alike = window_correlation(pixels, PATCH_WINDOW)
@@ -538,7 +577,7 @@ class FrameEstimation:
             points = self._joined(seen.points)
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, seen.weights])
-        return Observations(points, pixels, weights, normals, correlation, attempt.depths)
+        return Observations(points, pixels, weights, normals, correlation, depths)
 
     def _joined(self, outline: BoundPoints) -> BoundPoints:
         """The view's points followed by those of the outline, which mostly are those of the last call."""

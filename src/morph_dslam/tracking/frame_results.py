@@ -157,7 +157,7 @@ def _with_systematic_errors(
     # Learned from the images alone.
     learns = is_its_own and blurred is None and not len(view.estimation.known.indices)
     found, prior = hypothesis.estimate, hypothesis.prior
-    others = hypothesis.point_depths, view.estimation.hessian_of_outline(hypothesis), hypothesis.correction
+    others = hypothesis.corrected_depths, view.estimation.hessian_of_outline(hypothesis), hypothesis.correction
     estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, *others)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if blurred is not None:

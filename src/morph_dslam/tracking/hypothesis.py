@@ -77,7 +77,7 @@ class PoseHypothesis:
     weights : (p,) that the measurements counted with, zero for those that do not support the estimate.
     prior : what was known of the pose from the map; None if nothing was.
     outline : of the object's rim, where it counts.
-    correction : what the outline tells of the reference's error; None where it does not.
+    correction : what outline and depths tell of the reference's error; None where they do not.
     depths : of the points that support it, where a depth camera saw them.
     depth_unused : why there are none, where they are asked for.
     discrepancy : what the shape has beyond the model's, once it was estimated.
@@ -111,6 +111,12 @@ class PoseHypothesis:
     def point_depths(self) -> PointDepths | None:
         """The depths (p,) of the reference view's points, without those of an outline; None if there are none."""
         return None if self.depths is None else self.depths.take(np.arange(len(self.inliers)))
+
+    @property
+    def corrected_depths(self) -> PointDepths | None:
+        """`point_depths`, with what is known of the reference's error made good."""
+        depths = self.point_depths
+        return depths if depths is None or self.correction is None else self.correction.of_depths(depths)
 
     @property
     def outline_alone(self) -> bool:

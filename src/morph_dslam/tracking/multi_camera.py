@@ -17,6 +17,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import MissingFrame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor, CameraLocalization
+from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
 from morph_dslam.tracking.frame_results import warnings_of_place, with_flat_sides, with_model_errors
@@ -150,10 +151,9 @@ class RigTracker:
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter, self._gaps = new_filter(self.estimator, self.options), FrameGaps()
-        depth_stds = [self.options.depth_scale_std] * len(self.cameras)
-        if registration.depth_scale is not None:  # found with the pose, whose covariance holds its error
-            depth_stds[0] = 0.0
-        self._errors = RigErrors(self.trackers, self.cameras, depth_stds)
+        found, std = registration.depth_scale, self.options.depth_scale_std
+        scales = [CommonDepthScale.of(None if number else found, std) for number in range(len(self.cameras))]
+        self._errors = RigErrors(self.trackers, self.cameras, scales)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._sigma_px = FIRST_SIGMA_PX

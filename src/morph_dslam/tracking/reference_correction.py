@@ -1,4 +1,4 @@
-"""What an outline tells of the reference state's error, which the texture's points in a frame have in common.
+"""What an outline and depths tell of the reference state's error, which the texture's points of a frame have in common.
 
 The points were bound to the mesh by the reference state. Where that is off by its error factors z, each of variance
 one, the points alone have the object off by G z = H_t^-1 J' W M J0 F z (`systematic_errors`). Its outline refers to no
@@ -14,16 +14,21 @@ makes good: an outline that counts then pulls the points from where they fit. `C
 
 An outline may err as a whole: light from one side moves the edges on that side, and a rounded edge all of them. So it
 tells nothing that a shift of all of it, or one outwards, of `COMMON_PX` would explain: two more unknowns and a third.
+
+Depths tell of z in the same way, and have residuals J_d x + D z: a point that lies elsewhere on the surface has another
+depth there, and all depths may be too large by one factor. That is one more error factor; where depths have placed the
+reference, too, it is known by how far z has that too far away (`SystematicErrors`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.levenberg_marquardt import Minimum
 from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
@@ -43,6 +48,24 @@ CHANCE = 2.0 * float(scipy.special.ndtr(-REFUTED))
 
 
 @dataclass(frozen=True)
+class PushedDepths:
+    """The depths of the texture's points in a frame, times the roots of Huber's weights, and the error factors in them.
+
+    Attributes
+    ----------
+    residuals : (p,) pixels, zero of points without depth.
+    slopes : (p, d + 6) of these by the unknowns.
+    pushes : (p, c) of these by the error factors.
+    metres : (p, c) by which each error factor has the measured depths too large.
+    """
+
+    residuals: Array
+    slopes: Array
+    pushes: Array
+    metres: Array
+
+
+@dataclass(frozen=True)
 class PushedTexture:
     """The texture's points in a frame, and how they take the reference's error for motion.
 
@@ -50,10 +73,12 @@ class PushedTexture:
     ----------
     frame : the points about the state
     transfer : (d + 6, c), G: how the points alone have the object off by each error factor.
+    depths : of the points; None where no depth camera saw them.
     """
 
     frame: Linearization
     transfer: Array
+    depths: PushedDepths | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +92,7 @@ class ReferenceCorrection:
     transfer : (d + 6, c) as of `PushedTexture`.
     left : (c, c), a symmetric root of the covariance that is left of them, the stated one being the identity.
     information_lost : (d + 6, d + 6) of the points' Hessian, what the unknown error of the reference takes from it.
+    nearer : (p,) metres, by which it moves the depths of the texture's points; None where there are none.
     """
 
     found: Array
@@ -74,6 +100,15 @@ class ReferenceCorrection:
     transfer: Array
     left: Array
     information_lost: Array
+    nearer: Array | None = None
+
+    def of_depths(self, depths: PointDepths) -> PointDepths:
+        """Measured depths as they are corrected; those of points beyond the texture's stay."""
+        if self.nearer is None:
+            return depths
+        shift = np.zeros_like(depths.depths)
+        shift[: len(self.nearer)] = self.nearer
+        return replace(depths, depths=depths.depths - shift)
 
 
 class CorrectionCheck:
@@ -81,9 +116,10 @@ class CorrectionCheck:
 
     If it is, the points fit beside the outline as well as alone, once they are corrected. The sum of their squares then
     rises by what the state may be off by their noise, chi-squared of as many numbers as there are unknowns, and by what
-    the correction lacks of second order. A rise that is as unlikely as `REFUTED` deviations is another error's: the
-    model's, or clutter's that the outline was mistaken for. The registration's error is the same in all frames and
-    clutter passes. So the frames vote, and the correction is given up for good as soon as most are against it.
+    the correction lacks of second order. And the error factors are off by no more than was stated of them, chi-squared
+    of as many numbers. What is as unlikely as `REFUTED` deviations is another error's: the model's, or clutter's that
+    the outline was mistaken for. The registration's error is the same in all frames and clutter passes. So the frames
+    vote, and the correction is given up for good as soon as most are against it.
 
     Attributes
     ----------
@@ -94,9 +130,16 @@ class CorrectionCheck:
         self.is_refuted, self._ahead = False, 0
 
     def learn(
-        self, alone: Array, beside: Array, shift: Array, weights: Array, redundancy: float, n_unknowns: int
-    ) -> None:
-        """Take in a frame.
+        self,
+        alone: Array,
+        beside: Array,
+        shift: Array,
+        weights: Array,
+        redundancy: float,
+        n_unknowns: int,
+        found: Array,
+    ) -> bool:
+        """Take in a frame; whether the registration may be off by what the frame shows.
 
         Parameters
         ----------
@@ -106,13 +149,17 @@ class CorrectionCheck:
         weights : (p,) of the points.
         redundancy : how many of the points count as one, because their windows overlap.
         n_unknowns : of the state.
+        found : (c,) of the error factors, in the deviations that were stated of them.
         """
         # Where a picture is compared with itself, nearly nothing is left.
         noise = max(mean_square(alone, weights, n_unknowns), FLOOR_PX**2)
         squares = beside**2 - alone**2 - (SECOND_ORDER * shift) ** 2
         rise = float(weights @ np.sum(squares, axis=1)) / (redundancy * noise)
-        self._ahead += 1 if rise < float(scipy.special.chdtri(n_unknowns, CHANCE)) else -1
+        of_noise, of_stated = (float(scipy.special.chdtri(n, CHANCE)) for n in (n_unknowns, len(found)))
+        is_possible = float(found @ found) < of_stated
+        self._ahead += 1 if is_possible and rise < of_noise else -1
         self.is_refuted = self.is_refuted or self._ahead < 0
+        return is_possible
 
 
 def reference_correction(
@@ -138,7 +185,7 @@ def reference_correction(
     """
     count, state = len(texture.frame.usable), found.state
     _, hessian, gradient, residuals = estimator.evaluate(
-        together.points, together.pixels, together.weights, state, together.normals, prior
+        together.points, together.pixels, together.weights, state, together.normals, prior, together.depths
     )
     jacobian, outline = estimator.jacobian(together.points, state)[count:], slice(count, None)
     across = np.einsum("pkn,pk->pn", jacobian, together.normals[outline])
@@ -188,9 +235,12 @@ def corrected(
     (hessian, gradient), frame, transfer = others, texture.frame, texture.transfer
     stated = squared_px * np.eye(len(before))
     pushed = frame.hessian @ transfer
-    gain, by_points = inverse_of_seen(hessian, scale) @ pushed, stated + transfer.T @ pushed
+    by_points, push = stated + transfer.T @ pushed, transfer.T @ frame.products(frame.residuals[:, :, None])[:, 0]
+    if (depths := texture.depths) is not None:
+        pushed = pushed + depths.slopes.T @ depths.pushes
+        by_points, push = by_points + depths.pushes.T @ depths.pushes, push + depths.pushes.T @ depths.residuals
+    gain = inverse_of_seen(hessian, scale) @ pushed
     information = by_points - pushed.T @ gain
-    push = transfer.T @ frame.products(frame.residuals[:, :, None])[:, 0]
     found = before - np.linalg.solve(information, push + stated @ before - gain.T @ gradient)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     # No measurement makes the registration worse known than it was; rounding may seem to.
@@ -198,4 +248,5 @@ def corrected(
     left = (vectors * np.sqrt(shares)) @ vectors.T
     information_lost = pushed @ np.linalg.solve(by_points, pushed.T)
     shift = np.einsum("pkn,n->pk", frame.jacobian, transfer @ found)
-    return ReferenceCorrection(found, shift, transfer, left, information_lost)
+    nearer = None if depths is None else depths.metres @ found
+    return ReferenceCorrection(found, shift, transfer, left, information_lost, nearer)

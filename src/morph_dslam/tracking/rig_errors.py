@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.depth import SCALE_STD, PointDepths
+from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.linearization import inverse_of_seen
 from morph_dslam.tracking.measurement import PATCH_WINDOW
@@ -65,24 +66,29 @@ class RigErrors:
     trackers : by camera, each at its one reference view, which knows how its images are off by the error
         factors that are the same for all.
     cameras : of the rig.
-    depth_stds : by camera, standard deviation of the scale of its depths, a share; zero where the reference state holds
-        that already; by default the usual one. Each depth camera has a scale of its own.
+    scales : by camera, of its depths; by default as well known as usual. Each depth camera has a scale of its own.
     """
 
     def __init__(
-        self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera], depth_stds: Sequence[float] | None = None
+        self,
+        trackers: Sequence[Tracker],
+        cameras: Sequence[RigCamera],
+        scales: Sequence[CommonDepthScale] | None = None,
     ) -> None:
         parts = [part for tracker in trackers for part in tracker.reference.parts]
         self._is_known = all(part.error_factors is not None for part in parts)
         self._cameras, self._scale = cameras, trackers[0].estimator.scale
         self._chains = [part.chain(len(self._scale) - 6) for part in cameras]
+        self._depth_scales = [CommonDepthScale(SCALE_STD)] * len(cameras) if scales is None else scales
         self._systematic = [
-            SystematicErrors(tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW)
-            for tracker in trackers
-        ]
+            SystematicErrors(
+                tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW,
+                scale=scale if scale.in_reference else None,
+            )
+            for tracker, scale in zip(trackers, self._depth_scales, strict=True)
+        ]  # fmt: skip
         self._points = [tracker.reference.points for tracker in trackers]
         self._estimators = [tracker.estimator for tracker in trackers]
-        self._depth_stds = [SCALE_STD] * len(cameras) if depth_stds is None else depth_stds
 
     def added(
         self,
@@ -133,17 +139,18 @@ class RigErrors:
     def _moved_by_depths(self, hessian: Array, views: Sequence[CameraView]) -> Array:
         """How the scale of each camera's depths moves the estimate (d + 6, k), to either side.
 
-        By one deviation, and in squares by what the depths are seen to be off. Steps are finite, with what depths count
+        By one deviation, and in squares by what the depths are seen to be off; that of depths by which the reference
+        state was found is among its errors. Steps are finite, with what depths count
         there: the other cameras hold the estimate, so all depths of a camera whose scale is off are far from it, and
         Huber's cost lets them pull no more than they do.
         """
         moved = [np.empty((len(hessian), 0))]
-        for std, points, view in zip(self._depth_stds, self._points, views, strict=True):
-            if view.depths is None or not std:
+        for scale, points, view in zip(self._depth_scales, self._points, views, strict=True):
+            if view.depths is None or not scale.std or scale.in_reference:
                 continue
             state = view.estimate.state
             ratio = view.depths.ratio_to(points.in_camera(state)[:, 2])
-            off = float(np.hypot(std, 0.0 if ratio is None else ratio - 1.0))
+            off = float(np.hypot(scale.std, 0.0 if ratio is None else ratio - 1.0))
             now = view.depths.terms(points, state)
             for factor in (1.0 + off, 1.0 / (1.0 + off)):
                 then = view.depths.scaled(factor).terms(points, state)

@@ -32,19 +32,17 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.tracking.covariance import BoundPart, SharedErrors
-from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth import PointDepths, weighted_depths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
-from morph_dslam.tracking.reference_correction import PushedTexture, ReferenceCorrection
+from morph_dslam.tracking.reference_correction import PushedDepths, PushedTexture, ReferenceCorrection
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, BeyondReference, ReferenceMisfit, Unexplained
-from morph_dslam.tracking.reprojection import project_with_jacobian
+from morph_dslam.tracking.reprojection import huber_weights, project_with_jacobian
 
 Array = NDArray[np.float64]
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
-#: Derivatives by depths are differences over this share of an error factor.
-STEP = 1e-3
 
 
 def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
@@ -71,7 +69,7 @@ class SystematicErrors:
     parts : the reference images that they were bound in
     window : side of the square that is compared around a point, pixels
     still : whether the reference view's pose is that of every frame, with the same error
-    scale_std : as in `CommonDepthScale`
+    scale : of the depths, if a depth camera sees the points.
 
     Attributes
     ----------
@@ -85,10 +83,9 @@ class SystematicErrors:
         parts: Sequence[BoundPart],
         window: int,
         still: bool = False,
-        scale_std: float = 0.0,
+        scale: CommonDepthScale | None = None,
     ) -> None:
         self._estimator, self._points, self._still = estimator, points, still
-        self._scale = CommonDepthScale(scale_std, estimator.scale)
         self._misfit = ReferenceMisfit()
         self._corners = points.corners(estimator.model)
         edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
@@ -97,6 +94,9 @@ class SystematicErrors:
             adjugate = np.stack([edges[:, 1, 1], -edges[:, 0, 1], -edges[:, 1, 0], edges[:, 0, 0]], axis=1)
             self._inverse_edges = (adjugate / size[:, None]).reshape(-1, 2, 2)
         self._moved, self._factors = self._by_error_factors(parts), parts[0].error_factors
+        self._shares = np.zeros(0 if self._moved is None else self._moved.shape[2])
+        self._n_reference = len(self._shares)
+        self._take_scale(scale or CommonDepthScale(), parts)
         self._common = SharedErrors(self._places(parts[0].state), window)
         self.beyond_reference: BeyondReference | None = None
         self.forget_frames()
@@ -110,6 +110,41 @@ class SystematicErrors:
             moved.append(self._project(part.state)[1][part.rows] @ part.error_factors)
         return np.concatenate(moved)
 
+    def _take_scale(self, scale: CommonDepthScale, parts: Sequence[BoundPart]) -> None:
+        """Find by what share each error factor has all depths too large; their scale may be one more factor.
+
+        A reference state that was found by depths is as much too far away as these are too large: what its error
+        factors move the surface by along the pixels' sight lines, on average, is the scale's doing.
+        """
+        if not scale.std:
+            return
+        if scale.in_reference and self._moved is not None:
+            farther = np.concatenate([self._farther(part) for part in parts])
+            mean = np.mean(farther[np.isfinite(farther).all(axis=1)], axis=0)
+            self._shares = scale.std * mean / max(float(np.linalg.norm(mean)), 1e-300)
+            return
+        p = len(self._points)
+        moved = np.zeros((p, 2, 0)) if self._moved is None else self._moved
+        self._moved = np.concatenate([moved, np.zeros((p, 2, 1))], axis=2)
+        self._shares = np.append(self._shares, scale.std)
+        if self._factors is not None:
+            self._factors = np.column_stack([self._factors, np.zeros(len(self._factors))])
+
+    def _farther(self, part: BoundPart) -> Array:
+        """By what share each error factor has the surface at the pixels of a part's points farther away (p, c)."""
+        assert self._moved is not None
+        assert part.error_factors is not None
+        count = len(self._points)
+        ahead = weighted_depths(*self._points.in_state(part.state), np.zeros(count), np.ones(count))[1]
+        along = np.einsum("pb,pbc->pc", self._per_pixel(part.state), self._moved)
+        depths = self._points.in_camera(part.state)[:, 2]
+        return np.asarray(((ahead @ part.error_factors - along) / depths[:, None])[part.rows])
+
+    def _per_pixel(self, state: State) -> Array:
+        """How much farther away the points' triangles are in a state, for each pixel of the reference view (p, 2)."""
+        corners = self._corners.in_camera(state)[:, 2].reshape(-1, 3)
+        return np.asarray(np.einsum("pa,pab->pb", corners[:, 1:] - corners[:, :1], self._inverse_edges))
+
     def _places(self, state: State) -> Array:
         """Places (p, 3) of the points in an object of this state, in pixels at its depth."""
         camera, positions = self._estimator.camera, self._points.in_camera(state)
@@ -121,7 +156,6 @@ class SystematicErrors:
         n_factors = 0 if self._moved is None else self._moved.shape[2]
         self._by_reference = np.zeros((size, n_factors))
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
-        self._scale.forget_frames()
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
@@ -209,12 +243,13 @@ class SystematicErrors:
                 by_reference = gain @ (push - (frame.hessian + others)[:, d:] @ self._factors[d:])
                 by_reference[d:] = self._factors[d:]
             # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
-            if learns and not self._still:
+            if learns and not self._still and self._n_reference:
                 # The correction is along what the points alone take for motion: what they leave is the same.
                 left = frame.left(moved, by_reference if corrected is None else corrected.transfer)
                 self.beyond_reference = self._beyond_reference(frame, left, gain, n_pairs)
-                self._learn_reference(frame, left, n_pairs)
-            covariance += self._misfit.factor * by_reference @ by_reference.T
+                self._learn_reference(frame, left[:, :, : self._n_reference], n_pairs)
+            widened = by_reference * self._widening
+            covariance += widened @ widened.T
             stated = stated + by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain, n_pairs)
@@ -223,12 +258,16 @@ class SystematicErrors:
         if blurred is not None:
             by_blur = self.pushed_by_blur(frame, np.eye(len(gain)), gain, blurred)
             covariance += by_blur @ by_blur.T
-        by_scale = gain @ self._scale.push(self._points, estimate.state, past, depths)
-        covariance += np.outer(by_scale, by_scale)
         if keeps:
             self._by_reference, self._by_model = by_reference, by_model
-            self._scale.keep(by_scale)
         return replace(estimate, covariance=covariance, stated_covariance=stated)
+
+    @property
+    def _widening(self) -> Array:
+        """By how much larger than stated each error factor (c,) is: those of the reference alone, not the depths'."""
+        widening = np.ones(len(self._shares))
+        widening[: self._n_reference] = self.reference_factor
+        return widening
 
     def _learn_reference(self, frame: Linearization, left: Array, n_pairs: float) -> None:
         """Take in what a frame shows of the reference's error, which would leave ``left`` (p, 2, c) in it.
@@ -275,10 +314,13 @@ class SystematicErrors:
     def _pushed_by(self, moved: Array, frame: Linearization, state: State, depths: PointDepths | None) -> Array:
         """`pushed`, where the error factors move the pixels by ``moved`` (p, 2, c) in the frame."""
         by_pixels = frame.products(moved)
-        return by_pixels if depths is None else by_pixels + self._pushed_by_depths(state, depths, moved)
+        if depths is None:
+            return by_pixels
+        of_depths = self._pushed_depths(state, depths, moved)
+        return by_pixels + of_depths.slopes.T @ of_depths.pushes
 
-    def _pushed_by_depths(self, state: State, depths: PointDepths, moved: Array) -> Array:
-        """How the error factors of the reference enter the gradient of depths (d + 6, c), by other places' depths.
+    def _pushed_depths(self, state: State, depths: PointDepths, moved: Array) -> PushedDepths:
+        """How the error factors enter depths: by those of other places on the surface, and by the depths' scale.
 
         Parameters
         ----------
@@ -287,22 +329,23 @@ class SystematicErrors:
         moved : (p, 2, c) pixels, by which the points move there; zero of those that do not tell.
         """
         assert self._moved is not None
-        corners = self._corners.in_camera(state)[:, 2].reshape(-1, 3)
-        by_pixel = np.einsum("pa,pab->pb", corners[:, 1:] - corners[:, :1], self._inverse_edges)
+        by_pixel = self._per_pixel(state)
         tells = np.any(moved, axis=(1, 2), keepdims=True)[:, 0] & np.isfinite(by_pixel)
-        along = np.einsum("pb,pbc->pc", np.where(tells, by_pixel, 0.0), self._moved)
-        at, gradient = depths.depths, depths.terms(self._points, state)[2]
-        push = np.zeros((len(gradient), along.shape[1]))
-        for k, column in enumerate(along.T):
-            push[:, k] = (replace(depths, depths=at - STEP * column).terms(self._points, state)[2] - gradient) / STEP
-        return push
+        metres = np.einsum("pb,pbc->pc", np.where(tells, by_pixel, 0.0), self._moved)
+        metres += np.outer(depths.depths, self._shares)
+        residuals, slopes = depths.linearised(self._points, state)
+        roots = np.sqrt(huber_weights(np.abs(residuals), depths.huber_px))
+        pushes = (roots * depths.weights)[:, None] * metres
+        return PushedDepths(roots * residuals, roots[:, None] * slopes, pushes, metres)
 
     @property
     def knows_reference(self) -> bool:
         """Whether the reference's error is known, and none of the pose that holds in all frames."""
-        return self._moved is not None and not self._still
+        return self._n_reference > 0 and not self._still
 
-    def pushed_texture(self, state: State, residuals: Array, weights: Array) -> PushedTexture:
+    def pushed_texture(
+        self, state: State, residuals: Array, weights: Array, depths: PointDepths | None = None
+    ) -> PushedTexture:
         """The points in a frame, and how these alone take the reference's error for motion, where it is known.
 
         Parameters
@@ -310,10 +353,13 @@ class SystematicErrors:
         state : of the frame, to linearise about.
         residuals : (p, 2) that it leaves of the points, pixels.
         weights : (p,) of these.
+        depths : (p,) of these; None where no depth camera saw them.
         """
+        assert self._moved is not None
         frame = Linearization.of(self._project(state)[1], residuals, weights, self._estimator.options.huber_px)
-        transfer = inverse_of_seen(frame.hessian, self._estimator.scale) @ self.pushed(frame, state)
-        return PushedTexture(frame, transfer)
+        moved = self._warped(state, self._moved)
+        transfer = inverse_of_seen(frame.hessian, self._estimator.scale) @ frame.products(moved)
+        return PushedTexture(frame, transfer, None if depths is None else self._pushed_depths(state, depths, moved))
 
     def pushed_by_model(self, frame: Linearization, chain: Array, gain: Array, common_px: float) -> Array:
         """How an estimate from several cameras moves (n, c) by what the model is off in this one.
@@ -359,7 +405,7 @@ class SystematicErrors:
         of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
             what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        by_reference = self.reference_factor * self._by_reference
+        by_reference = self._widening * self._by_reference
         return partial(self._of_deformation, state, by_reference, by_known, of_model)
 
     def _of_deformation(

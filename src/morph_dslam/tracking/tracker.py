@@ -23,7 +23,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring, CameraLocalization
 from morph_dslam.tracking.compilation import announce_compilation
-from morph_dslam.tracking.depth_scale import DepthScale
+from morph_dslam.tracking.depth_scale import CommonDepthScale, DepthScale
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
 from morph_dslam.tracking.estimator import Estimator, Prior, State
@@ -366,7 +366,7 @@ class Tracker:
         with stage("outline"):
             hypothesis = estimation.fit_outline(image, hypothesis, self._view.systematic)
         with stage("depth"):
-            hypothesis = estimation.fit_depths(image, hypothesis)
+            hypothesis = estimation.fit_depths(image, hypothesis, self._view.systematic)
         with stage("search"):
             hypothesis = estimation.with_other_tilt(hypothesis)
         with stage("fuse"):
@@ -532,9 +532,8 @@ class Tracker:
             factors = keyframes.error_factors if view.outline_alone else None
             lasting = None if factors is None else factors[len(self.model.parameters) :]
             self._still = replace(held(known.state, self.estimator), lasting=lasting)
-        # A distance by depth holds the error of the depths' scale itself: the frames' depths confirm it.
-        scale_std = options.depth_scale_std if known.depth_scale is None else 0.0
-        self._views = ViewSet(self.estimator, view, options, scale_std)
+        scale = CommonDepthScale.of(known.depth_scale, options.depth_scale_std) if options.use_depth else None
+        self._views = ViewSet(self.estimator, view, options, scale)
         self._jumps = JumpDetector(view.points.rest, float(np.linalg.norm(np.ptp(self.model.nodes, axis=0))))
         self._anchoring = Anchoring(self.estimator, view, options)
         self.last_measured = view.nothing_measured

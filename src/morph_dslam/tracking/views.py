@@ -18,6 +18,7 @@ from morph_dslam.registration.registration import Registration
 from morph_dslam.slam.rigid_map import Keyframe
 from morph_dslam.timing import stage
 from morph_dslam.tracking.binding import DrawnSurface, draw_view, view_of
+from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Estimator, State
 from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -271,15 +272,15 @@ class ActiveView:
         options: TrackerOptions,
         number: int = 0,
         error: float = 0.0,
-        scale_std: float = 0.0,
+        scale: CommonDepthScale | None = None,
     ) -> ActiveView:
-        """A view that is to be followed from now on, with these numbers; ``scale_std`` as in `CommonDepthScale`."""
+        """A view that is to be followed from now on, with these numbers; ``scale`` is that of the depths."""
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
         systematic = None
         if not reference.outline_alone:
             still, parts = options.pose == "still" and not number, reference.parts
-            systematic = SystematicErrors(estimator, reference.points, parts, PATCH_WINDOW, still, scale_std)
+            systematic = SystematicErrors(estimator, reference.points, parts, PATCH_WINDOW, still, scale)
         return cls(number, reference, estimation, recovery, systematic, error)
 
 
@@ -327,7 +328,7 @@ class ViewSet:
     Parameters
     ----------
     reference : the first view.
-    scale_std : as in `CommonDepthScale`.
+    scale : of the depths; None without them.
 
     Attributes
     ----------
@@ -335,12 +336,16 @@ class ViewSet:
     """
 
     def __init__(
-        self, estimator: Estimator, reference: ReferenceView, options: TrackerOptions, scale_std: float = 0.0
+        self,
+        estimator: Estimator,
+        reference: ReferenceView,
+        options: TrackerOptions,
+        scale: CommonDepthScale | None = None,
     ) -> None:
-        self._estimator, self._options, self._scale_std = estimator, options, scale_std
+        self._estimator, self._options, self._scale = estimator, options, scale
         self._size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
         self._samples = SurfaceSamples(estimator, reference.surface)
-        self.active = ActiveView.of(reference, estimator, options, scale_std=scale_std)
+        self.active = ActiveView.of(reference, estimator, options, scale=scale)
         self._kept, self._seen = [self.active], [reference.shown(self._samples)]
         self._n_made, self._n_frames, self._pause = 0, 0, 0
         self._followed = self.active
@@ -457,9 +462,7 @@ class ViewSet:
             self.active.reference.take_features()
             return None
         self._n_made += 1
-        view = ActiveView.of(
-            begun.reference, self._estimator, self._options, self._n_made, begun.error, self._scale_std
-        )
+        view = ActiveView.of(begun.reference, self._estimator, self._options, self._n_made, begun.error, self._scale)
         self._kept.append(view)
         self._seen.append(begun.seen)
         if len(self._kept) > self._options.max_views:

@@ -1,0 +1,121 @@
+"""Objects whose texture is followed beside depth images, registered by clicks that are off.
+
+The registration's error is alike in all of the texture's points, and depths do not have it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import morph_dslam as md
+from morph_dslam.render.rasteriser import rasterise
+from morph_dslam.sources import Frame
+from tests.integration.test_outline_beside_texture import CAMERA as BEFORE_BLOCK, SpottedFilm, state as block_state
+from tests.support.bent_sheet import bent_sheet_model
+from tests.support.clicked import clicked
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
+
+#: Of a depth image, as the tracker takes it by default: metres at 1 m, alike within so many pixels.
+SIGMA_AT_1M, ALIKE_PX = 2.0e-3, 3
+#: Deviation of what all depths are off by together, a share.
+SCALE_STD = 0.01
+
+
+class Scene:
+    """A film with exact states, and what a depth camera measures beside it.
+
+    Parameters
+    ----------
+    kind : "sheet" or "block".
+    factor : that all depths are too large by.
+    """
+
+    def __init__(self, kind, seed, factor=1.0):
+        self.film = SheetFilm(bent_sheet_model(43, 31), seed=seed) if kind == "sheet" else SpottedFilm(300, seed)
+        self.camera, self._state = (CAMERA, sheet_state) if kind == "sheet" else (BEFORE_BLOCK, block_state)
+        self.model, self._factor, self.rng = self.film.model, factor, np.random.default_rng(1000 + seed)
+
+    def state(self, time):
+        return self._state(0.4 * time if self._state is sheet_state else time)
+
+    def frame(self, time):
+        state, camera, model = self.state(time), self.camera, self.model
+        nodes = state.camera_from_object.apply(model.positions(state.parameters))
+        exact = rasterise(camera.project(nodes), nodes[:, 2], model.triangles, camera.height, camera.width).depth
+        exact = np.where(np.isfinite(exact), exact, 1.5)
+        noise = self.rng.standard_normal((camera.height // ALIKE_PX + 2, camera.width // ALIKE_PX + 2))
+        noise = np.kron(noise, np.ones((ALIKE_PX, ALIKE_PX)))[1 : camera.height + 1, 1 : camera.width + 1]
+        depth = self._factor * (exact + SIGMA_AT_1M * exact**2 * noise)
+        return Frame(0, float(time), self.film.frame(state), depth.astype(np.float32))
+
+    def off(self, found, time):
+        """Errors of the parameters over half of their ranges."""
+        return (found.parameters - self.state(time).parameters) / (0.5 * (self.model.upper - self.model.lower))
+
+    def tracked(self, known, frames, **options):
+        """Errors (f, d) of the parameters, those in deviations, and those along the sight line in deviations (f,)."""
+        options = md.TrackerOptions(least_inliers=16, new_views=False, **options)
+        tracker = md.Tracker(self.model, self.camera, known, options, reference=frames[0].image)
+        off, sizes, along = [], [], []
+        for frame in frames:
+            found = tracker.track(frame if options.use_depth else frame.image).estimate
+            assert found is not None
+            off.append(self.off(found.state, frame.timestamp))
+            ranges = 0.5 * (self.model.upper - self.model.lower)
+            sizes.append(np.abs(off[-1]) * ranges / found.parameter_std)
+            distances = [s.camera_from_object.translation[2] for s in (found.state, self.state(frame.timestamp))]
+            along.append(abs(distances[0] - distances[1]) / found.pose_std[5])
+        return np.array(off), np.array(sizes), np.array(along)
+
+
+def test_depths_make_good_what_clicks_were_off_by():
+    """The clicks have the skew off by a twentieth of its range and more, depths tell it several times as exactly."""
+    scene = Scene("sheet", 1)
+    frames = [scene.frame(time) for time in (0.0, 0.1)]
+    known = clicked(scene.model, CAMERA, scene.state(0.0), scene.rng)
+    off, sizes, _ = scene.tracked(known, frames, use_depth=True)
+    by_clicks = np.abs(scene.off(known.state, 0.0))
+    assert by_clicks.max() > 0.05
+    assert np.abs(off).max() < 0.3 * by_clicks.max()
+    assert sizes.max() < 3.0
+
+
+def test_a_distance_by_depths_stays_as_uncertain_as_these_are():
+    """The depths of further frames are too large by the same factor, and confirm what the registration has of it."""
+    scene = Scene("sheet", 2, 1.0 + SCALE_STD)
+    frames = [scene.frame(time) for time in (0.0, 0.1)]
+    known = clicked(scene.model, CAMERA, scene.state(0.0), scene.rng, depth=frames[0].depth)
+    _, _, along = scene.tracked(known, frames, use_depth=True)
+    by_registration = abs(
+        known.state.camera_from_object.translation[2] - scene.state(0.0).camera_from_object.translation[2]
+    )
+    by_registration /= np.sqrt(known.covariance[-1, -1])
+    assert along == pytest.approx([by_registration] * 2, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "px"), [("sheet", 0.5), ("block", 1.0)])
+def test_texture_beside_depth_does_no_harm(kind, px):
+    """Root mean square errors over registrations, beside those of either alone.
+
+    Depths count at the texture's points, of which there are half as many as a registration compares, or less: a frame
+    that is registered by its depth is as much more exact.
+    """
+    found, sizes = {"depth": [], "texture": [], "both": []}, []
+    for seed in range(1, 4):
+        scene = Scene(kind, seed, 1.0 + SCALE_STD * np.random.default_rng(seed).standard_normal())
+        frames = [scene.frame(time) for time in np.linspace(0.0, 0.6, 4)]
+        known = clicked(scene.model, scene.camera, scene.state(0.0), scene.rng, px)
+        found["texture"].append(scene.tracked(known, frames)[0])
+        off, in_deviations, along = scene.tracked(known, frames, use_depth=True)
+        found["both"].append(off)
+        sizes += [in_deviations.ravel(), along]
+        for frame in frames:
+            there = scene.state(frame.timestamp)
+            alone = clicked(scene.model, scene.camera, there, scene.rng, px, depth=frame.depth)
+            found["depth"].append(scene.off(alone.state, frame.timestamp)[None])
+    rms = {name: np.sqrt(np.mean(np.concatenate(rows) ** 2, axis=0)) for name, rows in found.items()}
+    assert np.all(rms["both"] < 0.4 * rms["texture"])
+    assert np.all(rms["both"] < 2.0 * rms["depth"])
+    assert 1.0 < np.quantile(np.concatenate(sizes), 0.95) < 2.6
