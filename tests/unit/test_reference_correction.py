@@ -6,7 +6,6 @@ import pytest
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.linearization import Linearization
 from morph_dslam.tracking.reference_correction import (
-    COMMON_PX,
     CorrectionCheck,
     PushedDepths,
     PushedTexture,
@@ -15,7 +14,7 @@ from morph_dslam.tracking.reference_correction import (
 )
 
 N_POINTS, N_OUTLINE, N_UNKNOWNS, N_FACTORS = 12, 30, 5, 4
-SQUARED_PX, WEIGHT = 0.04, 0.3
+SQUARED_PX, WEIGHT, COMMON_PX = 0.04, 0.3, 0.7
 #: Of the points whose fits are checked: how many, their deviation, pixels, and what the correction moves them by.
 N_CHECKED, NOISE_PX, SHIFT_PX = 60, 0.2, 0.4
 
@@ -42,7 +41,7 @@ def correction(frame):
     flat = jacobian.reshape(-1, N_UNKNOWNS)
     hessian = flat.T @ flat + WEIGHT * across.T @ across
     gradient = flat.T @ residuals.ravel() + WEIGHT * across.T @ off
-    common = of_common_errors(across, off, weights, normals, SQUARED_PX)
+    common = of_common_errors(across, off, weights, normals, SQUARED_PX, COMMON_PX)
     whole = hessian - common[0], gradient - common[1]
     texture = PushedTexture(points, transfer)
     return corrected(texture, whole, SQUARED_PX, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))

@@ -421,7 +421,7 @@ class FrameEstimation:
         if systematic is None or not tells or np.isnan(squared_px):
             return attempt, found
         pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights, depths)
-        asked = found, attempt.prior, pushed, squared_px, attempt.correction
+        asked = found, attempt.prior, pushed, squared_px, attempt.correction, self._balance.common_px
         attempt = replace(attempt, correction=reference_correction(self._estimator, together, *asked))
         return attempt, estimator.fitted(self.measured(attempt, correlated=False), found.state, attempt.prior)
 

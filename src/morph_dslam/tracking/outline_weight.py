@@ -28,6 +28,8 @@ NEAR_PX = 40.0
 FIRST_LENGTH_PX = 8.0
 #: The outline is known no better than by this, pixels: where a rounded edge turns away is no line.
 LEAST_SPREAD_PX = 0.1
+#: As a whole an outline may be off by this much or more in each direction, and outwards; a standard deviation, pixels.
+LEAST_COMMON_PX = 0.1
 #: Standard deviations beyond which a point does not agree, and the least such limit, pixels.
 AGREEING_SIGMAS, LEAST_LIMIT_PX = 3.0, 0.5
 #: The same limit where the outline is alone: as long as the state is wrong all of it is off.
@@ -122,6 +124,16 @@ class OutlineBalance:
             return 0.0
         ours = self.outline.redundancy * max(self.outline.variance, LEAST_SPREAD_PX**2)
         return self.texture.independent / ours
+
+    @property
+    def common_px(self) -> float:
+        """What the outline may be off by as a whole, a standard deviation, pixels: as much as its points are.
+
+        Residuals do not tell of it, as the state takes it up. But what displaces single points, such as clutter, an
+        edge that is rounded or a model that is off, may displace them together.
+        """
+        variance = self.outline.variance
+        return LEAST_COMMON_PX if np.isnan(variance) else max(LEAST_COMMON_PX, float(np.sqrt(variance)))
 
     def correlation(self, seen: OutlineMeasurement) -> scipy.sparse.csr_array:
         """Of the errors (p, p) of the outline's points; those that do not count have none in common."""

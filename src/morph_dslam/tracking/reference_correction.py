@@ -13,7 +13,8 @@ Texture and outline disagree by the model's error, too, where it cannot take the
 makes good: an outline that counts then pulls the points from where they fit. `CorrectionCheck` looks whether it does.
 
 An outline may err as a whole: light from one side moves the edges on that side, and a rounded edge all of them. So it
-tells nothing that a shift of all of it, or one outwards, of `COMMON_PX` would explain: two more unknowns and a third.
+tells nothing that a shift of all of it, or one outwards, would explain: two more unknowns and a third. Their deviation
+is `OutlineBalance.common_px`.
 
 Depths tell of z in the same way, and have residuals J_d x + D z: a point that lies elsewhere on the surface has another
 depth there, and all depths may be too large by one factor. That is one more error factor; where depths have placed the
@@ -39,8 +40,6 @@ from morph_dslam.tracking.reprojection import huber_weights
 from morph_dslam.tracking.state import Prior
 
 Array = NDArray[np.float64]
-#: Standard deviation of what an outline may be off by as a whole in each direction, and outwards, pixels.
-COMMON_PX = 0.1
 #: A correction, which is to first order, may be off by this share of itself.
 SECOND_ORDER = 0.1
 #: Probability that a Gaussian number is farther off than `REFUTED` deviations.
@@ -170,6 +169,7 @@ def reference_correction(
     texture: PushedTexture,
     squared_px: float,
     before: ReferenceCorrection | None,
+    common_px: float,
 ) -> ReferenceCorrection:
     """The reference's error about the minimum of a frame's cost, to first order.
 
@@ -182,6 +182,7 @@ def reference_correction(
     texture : the points about the minimum.
     squared_px : variance of a number of weight one, times how many points of the texture count as one.
     before : the correction so far; None for the first one.
+    common_px : as in `of_common_errors`.
     """
     count, state = len(texture.frame.usable), found.state
     _, hessian, gradient, residuals = estimator.evaluate(
@@ -193,13 +194,14 @@ def reference_correction(
     huber = huber_weights(np.abs(off), estimator.options.huber_px)
     weights = np.where(np.isfinite(off), together.weights[outline] * huber, 0.0)
     used = weights > 0.0
-    common = of_common_errors(across[used], off[used], weights[used], together.normals[outline][used], squared_px)
+    normals = together.normals[outline][used]
+    common = of_common_errors(across[used], off[used], weights[used], normals, squared_px, common_px)
     so_far = np.zeros(texture.transfer.shape[1]) if before is None else before.found
     return corrected(texture, (hessian - common[0], gradient - common[1]), squared_px, estimator.scale, so_far)
 
 
 def of_common_errors(
-    across: Array, off: Array, weights: Array, normals: Array, squared_px: float
+    across: Array, off: Array, weights: Array, normals: Array, squared_px: float, common_px: float
 ) -> tuple[Array, Array]:
     """What errors of a whole outline take away from the Hessian (n, n) and the gradient (n,) of its points.
 
@@ -210,10 +212,11 @@ def of_common_errors(
     weights : (k,).
     normals : (k, 2) outwards.
     squared_px : variance of a number of weight one.
+    common_px : standard deviation of what the outline may be off by as a whole in each direction, and outwards, pixels.
     """
     common = np.column_stack([np.ones(len(normals)), normals])
     weighted = weights[:, None] * common
-    inverse = np.linalg.inv(weighted.T @ common + squared_px / COMMON_PX**2 * np.eye(3))
+    inverse = np.linalg.inv(weighted.T @ common + squared_px / common_px**2 * np.eye(3))
     mixed = across.T @ weighted
     return mixed @ inverse @ mixed.T, mixed @ inverse @ (weighted.T @ off)
 
