@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from scipy.linalg import sqrtm
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import CameraError, TrackingError
@@ -22,6 +23,7 @@ from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estim
 from morph_dslam.tracking.multi_camera import RigTracker, agreeing
 from morph_dslam.tracking.noise import RigObservations
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.reference_correction import ReferenceCorrection
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
 from morph_dslam.tracking.rig_errors import RigErrors
 from morph_dslam.tracking.sequence_filter import SequenceFilter
@@ -297,18 +299,22 @@ def check_prediction(model, pictures, depth_weight=None):
     assert_moved_as_stated(LATER, found.state, stated, trackers[0].estimator.scale)
 
 
-def assert_moved_as_stated(before, after, stated, scale):
-    """One deviation of a cause, whose covariance (9, 9) is stated, has moved a state."""
+def away_from(before, after):
+    """By what (9,) a state is off from another: parameters, rotation vector and translation."""
     pose, true = after.camera_from_object, before.camera_from_object
     turn = pose.rotation @ true.rotation.T
-    away = np.concatenate(
+    return np.concatenate(
         [
             after.parameters - before.parameters,
             0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]),
             pose.translation - true.translation,
         ]
     )
-    away, deviations = away / scale, np.sqrt(np.diag(stated)) / scale
+
+
+def assert_moved_as_stated(before, after, stated, scale):
+    """One deviation of a cause, whose covariance (9, 9) is stated, has moved a state."""
+    away, deviations = away_from(before, after) / scale, np.sqrt(np.diag(stated)) / scale
     assert np.linalg.norm(away) > 1e-4
     np.testing.assert_allclose(deviations, np.abs(away), atol=0.1 * np.linalg.norm(away))
 
@@ -328,6 +334,38 @@ def test_of_two_pictures_each_is_off_in_its_own_way_by_the_same_cause(model, ste
     other = np.roll(STEPS, 4, axis=0)[np.argmax(step)]
     pictures = [(REFERENCE, step), (ANOTHER, other)]
     check_prediction(model, [(true, moved(true, own), own[:, None]) for true, own in pictures])
+
+
+def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_estimate_as_stated(model):
+    """Against draws of the error and of what each outline tells of it; how it moves the estimate is found by fits.
+
+    The outline of one camera tells the factors ten times as exactly as the registration, that of the other hardly.
+    """
+    rng, factors = np.random.default_rng(6), STEPS[[0, 3, 8]].T
+    _, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, factors)])
+    estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
+    before, moves = estimator.fit(seen, LATER), np.zeros((2, 9, 3))
+    for k, step in enumerate(factors.T):
+        _, wrong, _ = estimated(model, [(REFERENCE, moved(REFERENCE, step), None)])
+        for camera in range(2):
+            views = list(seen.views)
+            views[camera] = wrong.views[camera]
+            moves[camera, :, k] = away_from(before.state, estimator.fit(RigObservations(tuple(views)), LATER).state)
+    z, off, corrections = rng.standard_normal((20000, 3)), np.zeros((20000, 9)), []
+    for camera, exactness in enumerate((10.0, 0.5)):
+        root = exactness * (np.eye(3) + 0.3 * rng.standard_normal((3, 3)))
+        information = root @ root.T
+        told = z + np.linalg.solve(root.T, rng.standard_normal(z.shape).T).T
+        covariance = np.linalg.inv(np.eye(3) + information)
+        off += (z - told @ information @ covariance) @ moves[camera].T
+        nothing = np.zeros(0)
+        corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
+    errors, plain = RigErrors(trackers, RIG, [0.0, 0.0]), replace(before, covariance=np.zeros((9, 9)))
+    stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
+    scales = np.outer(estimator.scale, estimator.scale)
+    drawn = np.cov(off.T) / scales
+    np.testing.assert_allclose(stated / scales, drawn, atol=0.1 * np.linalg.norm(drawn))
+    np.testing.assert_allclose(np.sqrt(np.diag(stated / scales)), np.sqrt(np.diag(drawn)), rtol=0.2)
 
 
 def test_nothing_is_added_where_nothing_is_known(model):

@@ -270,7 +270,8 @@ class RigTracker:
         self, estimate: Estimate, measured: RigObservations, prior: Prior | None
     ) -> tuple[Estimate, list[Unexplained]]:
         """The common estimate with the errors in its covariance, and what it leaves of each camera's residuals."""
-        views = self._errors.views(estimate, measured)
+        corrected = [tracker.last_correction for tracker in self.trackers]
+        views = self._errors.views(estimate, measured, corrected)
         left = [view.unexplained for view in views]
         blurred = [tracker.last_blurred for tracker in self.trackers]
         common = [

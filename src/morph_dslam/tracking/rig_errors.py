@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from morph_dslam.tracking.depth import SCALE_STD, PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
-from morph_dslam.tracking.linearization import inverse_of_seen
+from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
 from morph_dslam.tracking.measurement import PATCH_WINDOW
 from morph_dslam.tracking.noise import RigObservations
+from morph_dslam.tracking.reference_correction import ReferenceCorrection
 from morph_dslam.tracking.reference_misfit import Unexplained
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.systematic_errors import SystematicErrors
@@ -34,6 +35,7 @@ class CameraView:
     weights : (p,) of these, zero for those that do not count.
     depths : (p,) of these, where a depth camera saw them.
     of_others : (d + 6, d + 6) in the camera's frame, what depths and an outline add to the Hessian.
+    corrected : what of the reference's error the camera's points were corrected by; None where they were not.
     """
 
     chain: Array
@@ -42,6 +44,7 @@ class CameraView:
     weights: Array
     depths: PointDepths | None
     of_others: Array
+    corrected: ReferenceCorrection | None = None
 
     @property
     def unexplained(self) -> Unexplained:
@@ -58,8 +61,10 @@ class RigErrors:
     As for one camera (`systematic_errors`), an error e of the reference state enters each estimate through the
     points that were bound by it. Each camera sees e as C e, with C its chain from increments in the rig's frame
     to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In other
-    reference images of the undeformed object the same error factors make another e each. What neighbouring points
-    of a camera's image have in common in the residuals enters as for one camera, each camera's by itself.
+    reference images of the undeformed object the same error factors make another e each. Where a camera's outline has
+    corrected its points, what is left of the factors takes their place (`ReferenceCorrection.left_by_cause`). What
+    neighbouring points of a camera's image have in common in the residuals enters as for one camera, each camera's by
+    itself.
 
     Parameters
     ----------
@@ -129,10 +134,7 @@ class RigErrors:
         moved = self._moved_by_depths(hessian, views)
         covariance = covariance + moved @ moved.T
         if self._is_known:
-            pushes = [
-                view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths) for view, frame in both
-            ]
-            transfer = gain @ np.sum(pushes, axis=0)
+            transfer = gain @ _pushed_by_reference(both)
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
@@ -159,12 +161,21 @@ class RigErrors:
                 moved.append(step[:, None] / np.sqrt(2.0))
         return np.concatenate(moved, axis=1)
 
-    def views(self, estimate: Estimate, measured: RigObservations) -> list[CameraView]:
-        """What each camera measured, about an estimate, a state in the rig's frame, that was made from it."""
-        views, first = [], 0
-        for part, chain, systematic, points, estimator, view in zip(
-            self._cameras, self._chains, self._systematic, self._points, self._estimators, measured.views, strict=True
-        ):
+    def views(
+        self,
+        estimate: Estimate,
+        measured: RigObservations,
+        corrected: Sequence[ReferenceCorrection | None] | None = None,
+    ) -> list[CameraView]:
+        """What each camera measured, about an estimate, a state in the rig's frame, that was made from it.
+
+        ``corrected`` : by camera as in `CameraView`; None for none.
+        """
+        views, first, corrections = [], 0, corrected or [None] * len(self._cameras)
+        for part, chain, systematic, points, estimator, view, correction in zip(
+            self._cameras, self._chains, self._systematic, self._points, self._estimators, measured.views, corrections,
+            strict=True,
+        ):  # fmt: skip
             count = len(points)
             seen = replace(
                 estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
@@ -180,6 +191,22 @@ class RigErrors:
             )[1]
             if depths is not None:
                 of_others = of_others + depths.terms(points, seen.state)[1]
-            views.append(CameraView(chain, systematic, seen, view.weights[:count], depths, of_others))
+            views.append(CameraView(chain, systematic, seen, view.weights[:count], depths, of_others, correction))
             first += len(view.weights)
         return views
+
+
+def _pushed_by_reference(views: Sequence[tuple[CameraView, Linearization]]) -> Array:
+    """How the reference's error enters the gradient of all cameras (d + 6, k), by independent causes.
+
+    ``views`` : with the points about the estimate.
+    """
+    in_common, by_noise = [], []
+    for view, frame in views:
+        push = view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths)
+        if view.corrected is not None:
+            of_reference, of_noise = view.corrected.left_by_cause
+            by_noise.append(push @ of_noise)
+            push = push @ of_reference
+        in_common.append(push)
+    return np.concatenate([np.sum(in_common, axis=0), *by_noise], axis=1)

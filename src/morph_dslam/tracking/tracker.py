@@ -44,6 +44,7 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, RejectionReason, Status
 from morph_dslam.tracking.patches import LEVELS, follow, zero_where_unknown
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, first_view
+from morph_dslam.tracking.reference_correction import ReferenceCorrection
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.row_motion import StateHistory
@@ -100,6 +101,7 @@ class Tracker:
     last_seen : where the first view's points were in the last frame that was compared with it.
     last_measured : what the last frame's estimate was made from; without weights if the object was lost.
     last_blurred : (p, 2), the paths over which motion smeared the points in it; None where it did no harm.
+    last_correction : what of the reference's error its points were corrected by; None where they were not.
     last_doubt_px : what the points that agreed in it may have in common, as of `Recovery.doubt`.
     is_taken : whether another object stands where this one would stand in a state, in the frame of the camera: there it
         is not found again after a loss. A `Session` of several objects sets it; None where no other is known.
@@ -156,6 +158,7 @@ class Tracker:
         self._history = StateHistory(camera, self.model.nodes.mean(axis=0))
         self.last_seen: Keyframe | None = None
         self.last_blurred: Array | None = None
+        self.last_correction: ReferenceCorrection | None = None
         self.last_doubt_px = 0.0
         self._views: ViewSet | None = None
         self._last = self._velocity_base = self._start = registration.state
@@ -385,7 +388,7 @@ class Tracker:
                 systematic = None if self._view.number or not self._in_sequence else self._view.systematic
                 warped = None if systematic is None else systematic.warped
                 hypothesis = estimation.with_blur(image, hypothesis, self._last, warped)
-        self.last_blurred = hypothesis.blurred
+        self.last_blurred, self.last_correction = hypothesis.blurred, hypothesis.correction
         if camera.pose_prior is not None and not hypothesis.outline_alone:
             self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
         return hypothesis
@@ -399,6 +402,7 @@ class Tracker:
         else:
             self._filter.go_on()
             self.last_measured, self.last_blurred = self.reference.nothing_measured, None
+            self.last_correction = None
             self._forget_loads()
             placed = self._placed_by_map(camera)
             if placed is not None:
@@ -512,7 +516,7 @@ class Tracker:
             self._gaps.after_gap(timestamp)
         if self._views is not None:  # before the first frame nothing is followed that could be lost
             self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
-            self.last_doubt_px = 0.0
+            self.last_doubt_px, self.last_correction = 0.0, None
             self._n_lost += 1
             self._forget_loads()
         rejection = Rejection(RejectionReason.NO_PICTURE)
