@@ -96,17 +96,31 @@ def by_rows():
 
 def test_tracks_of_a_rolling_shutter_are_compared_where_its_rows_show_the_points():
     """At the instant of the middle row, "b" is about 1 px elsewhere; a parabola is its path."""
-    exact = evaluate_pixels(rolling_run(INTERVAL * np.arange(len(FRAMES))), tracks(by_rows()))
+    # In the first frame the tracker does not know how the sheet moves.
+    exact = evaluate_pixels(rolling_run(INTERVAL * np.arange(len(FRAMES))), tracks(by_rows()[1:], FRAMES[1:]))
     assert exact["max_px"] < 1e-6
     assert exact["max_mm"] < 1e-6
     assert exact["notes"] == []
-    # Frame 22 is missing, and 23 has only later frames within the time.
-    times = INTERVAL * np.arange(len(FRAMES)) + np.where(FRAMES > 22, 1.0, 0.0)
-    run = rolling_run(times)
+
+
+@pytest.mark.parametrize("away_s", [0.0, 1.0])
+def test_a_frame_whose_motion_the_tracker_did_not_know_is_compared_as_it_was_estimated(away_s):
+    """The first one, and that after a loss, or after a gap too; their states are as the rows of "b" show it."""
+    times = INTERVAL * np.arange(len(FRAMES)) + np.where(FRAMES > 22, away_s, 0.0)
+    run, instants = rolling_run(times), INTERVAL * np.arange(len(FRAMES)) + READOUT * (284.0 - 239.5) / 480.0
+    as_seen = np.isin(FRAMES, [20, 23])
+    run.camera_from_object[as_seen, 0, 3] = slid(instants[as_seen])
     run.parameters[FRAMES == 22] = np.nan
-    gap = evaluate_pixels(run, tracks(by_rows()), bind_frame=24)
-    assert gap["per_frame"]["23"]["max_px"] < 1e-6
-    assert gap["notes"] == []
+    words = np.where(FRAMES == 22, "lost", "tracked")
+    only_b = PixelTracks(("b",), FRAMES, by_rows()[:, 1:2])
+    figures = evaluate_pixels(replace(run, status=tuple(words.tolist())), only_b)
+    assert figures["frames_compared"] == [21, 23, 24, 25]
+    assert figures["per_frame"]["23"]["max_px"] < 1e-6
+    # Beside such a frame others tell less exactly how the sheet moves, from evenly to faster.
+    assert figures["max_px"] < 0.2
+    (note,) = figures["notes"]
+    assert "20 and 23" in note
+    assert "--bind-frame" in note
 
 
 def test_a_point_that_moves_across_the_rows_is_found_in_its_row():
@@ -116,7 +130,7 @@ def test_a_point_that_moves_across_the_rows_is_found_in_its_row():
     pixels, share = np.tile(projected()[:1], (len(FRAMES), 1, 1)), 264.0 * READOUT / 480.0
     pixels[..., 1] = (pixels[..., 1] + 264.0 * times[:, None] - share * 239.5) / (1.0 - share)
     run = replace(run, timestamps=times)
-    assert evaluate_pixels(run, tracks(pixels))["max_px"] < 1e-4
+    assert evaluate_pixels(run, tracks(pixels[1:], FRAMES[1:]))["max_px"] < 1e-4
 
 
 @pytest.mark.parametrize("timestamps", [None, 0.5 * np.arange(len(FRAMES))])
