@@ -75,6 +75,42 @@ def test_what_moves_on_evenly_needs_no_state_in_the_frame():
     assert moved == pytest.approx(places(motion(0.0)), abs=1e-9)
 
 
+def test_states_of_points_that_are_bound_wrongly_are_compared_with_each_other():
+    """An outline has moved all states by 4 mm, in frames of a sheet that moves evenly."""
+
+    def by_points(time):
+        return state_at(time, (0.2, -0.3, 0.0))
+
+    def corrected(time):
+        there = by_points(time)
+        pose = there.camera_from_object
+        return replace(
+            there, camera_from_object=RigidTransform(pose.rotation, pose.translation + np.array([4e-3, 0.0, 0.0]))
+        )
+
+    known = StateHistory(CAMERA, np.zeros(3))
+    for frame in (-2, -1):
+        known.motion(INTERVAL * frame)
+        known.add(corrected(INTERVAL * frame), by_points(INTERVAL * frame))
+    for motion, states in ((known.motion(0.0), corrected), (known.motion(0.0).of_points, by_points)):
+        seen, _ = recorded(states)
+        assert seen - motion.shift(places, states(0.0), seen) == pytest.approx(places(states(0.0)), abs=1e-9)
+    # What else is seen moves as the points do, wherever it is in this frame.
+    seen, _ = recorded(corrected)
+    motion = known.motion(0.0).moving_as(by_points(0.0))
+    assert seen - motion.shift(places, corrected(0.0), seen) == pytest.approx(places(corrected(0.0)), abs=1e-9)
+    # Other points, which were bound by the corrected states, have the object there.
+    known.change_points(None)
+    seen, _ = recorded(corrected)
+    moved = known.motion(0.0).of_points.shift(places, corrected(0.0), seen)
+    assert seen - moved == pytest.approx(places(corrected(0.0)), abs=1e-9)
+    # Of those that nothing else has bound only the last frame tells.
+    known.change_points(by_points(-INTERVAL))
+    seen, _ = recorded(by_points)
+    moved = known.motion(0.0).of_points.shift(places, by_points(0.0), seen)
+    assert seen - moved == pytest.approx(places(by_points(0.0)), abs=1e-9)
+
+
 def test_the_object_is_drawn_where_its_rows_show_it():
     def motion(time):
         return state_at(time, (0.2, -0.3, 0.0), turning=(0.0, 0.0, 0.4))

@@ -106,7 +106,8 @@ class FrameEstimation:
         """
         measurement = self._reference.measure(picture, state, offsets)
         with stage("estimate"):
-            return self._trimmed(measurement, state, prior, picture.motion)
+            motion = None if picture.motion is None else picture.motion.of_points
+            return self._trimmed(measurement, state, prior, motion)
 
     def correct_shape(self, picture: Image, attempt: PoseHypothesis) -> PoseHypothesis:
         """Measure again in the state that was found, as long as windows miss a part of the change that would show.
@@ -248,7 +249,8 @@ class FrameEstimation:
         )  # fmt: skip
         if other.ratio < -(LIKELIER**2):
             taken, other = other.state, other.left(attempt.estimate.state)
-            attempt = replace(attempt, estimate=self._estimator.fit(measured, taken), correction=None)
+            estimate = self._estimator.fit(measured, taken)
+            attempt = replace(attempt, estimate=estimate, correction=None, by_points=estimate.state)
         return replace(attempt, other_tilt=None if other.is_excluded else other)
 
     def _loads_hide_much(self, attempt: PoseHypothesis) -> bool:
@@ -380,7 +382,8 @@ class FrameEstimation:
         if picture.has_grey and not outline.knows_brightness:
             outline.take_brightness(picture.grey, estimate.state)
         drawing, occluders = attempt.measurement.drawing, picture.occluder_depth
-        seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing, picture.motion)
+        motion = None if picture.motion is None else picture.motion.moving_as(estimate.state)
+        seen = outline.measure(picture.grey, estimate.state, REACH_PX, occluders, drawing, motion)
         seen = self._uncovered(seen, attempt, estimate.state)
         is_first = balance.weight == 0.0
         anew = is_first and systematic is not None and balance.suppose_exact_outline(seen)
@@ -392,7 +395,7 @@ class FrameEstimation:
         # After the first search the state only says where to look the second time: it need not be exact.
         attempt = replace(attempt, outline=seen.weighted(balance.weight))
         attempt, found = self._corrected(attempt, estimate.state, systematic, self._scout)
-        seen = outline.measure_again(picture.grey, found.state, REACH_PX // 2, occluders, picture.motion)
+        seen = outline.measure_again(picture.grey, found.state, REACH_PX // 2, occluders, motion)
         seen = self._uncovered(seen, attempt, found.state)
         for _ in range(FIRST_ROUNDS if anew else 1):
             seen = seen.weighted(balance.weight)
@@ -536,7 +539,7 @@ class FrameEstimation:
     def with_blur(
         self, picture: Image, attempt: PoseHypothesis, last: State, warped: Callable[[State, Array], Array] | None
     ) -> PoseHypothesis:
-        """The attempt with the paths over which motion since the ``last`` state blurs the picture.
+        """The attempt with the paths over which motion since the ``last`` state by the points blurs the picture.
 
         With ``warped``, which leads motions (p, 2) of points in the reference view to a frame, also with what the frame
         tells of the reference picture.

@@ -89,6 +89,7 @@ class PoseHypothesis:
     tilt_asked : whether the points were asked for it.
     reference_blur_px : the root mean square length of the paths over which motion smears the reference picture, pixels;
         0 where it does no harm, or is not known.
+    by_points : the state by the texture's points alone, before anything else counted; None where it is the estimate's.
     """
 
     estimate: Estimate
@@ -106,6 +107,12 @@ class PoseHypothesis:
     other_tilt: OtherTilt | None = None
     tilt_asked: bool = False
     reference_blur_px: float = 0.0
+    by_points: State | None = None
+
+    @property
+    def points_state(self) -> State:
+        """The state in which the texture's points were found, with the error that their reference gives them."""
+        return self.estimate.state if self.by_points is None else self.by_points
 
     @property
     def point_depths(self) -> PointDepths | None:

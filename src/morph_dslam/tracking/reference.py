@@ -360,7 +360,7 @@ class ReferenceView:
             )  # fmt: skip
             if picture.occluder_depth is not None:
                 visible &= visible_points(predicted, positions[:, 2], picture.occluder_depth, tolerance)
-            drift = None if picture.motion is None else picture.motion.drift(self.projected, state)
+            drift = None if picture.motion is None else picture.motion.of_points.drift(self.projected, state)
             found = compare_with_rendering(picture.normalized, rendering, predicted, visible, offsets, drift)
         drawing = Drawing(state, view, rendering.triangle_ids, rendering.depth)
         return replace(found, drawing=drawing, rendered=rendering.image)

@@ -3,7 +3,9 @@
 Rows are recorded one after the other while camera and object move on. An object that moves along the image then looks
 stretched or sheared, which a deformable model takes for a deformation. A state is that of the middle row's instant.
 A point's path in the image is that through its places in this state and in the last two, and a pixel is moved back
-along it by the time of its row. It holds for what the camera, the object and its deformation do alike.
+along it by the time of its row. It holds for what the camera, the object and its deformation do alike. The states must
+be of one kind: by the texture's points alone, which have the error of their reference in common, or with what an
+outline, depths and earlier frames tell beside these. The difference of the two kinds would pass for a motion.
 """
 
 from __future__ import annotations
@@ -39,11 +41,30 @@ class RowMotion:
     camera : with its readout time.
     centre : (3,) of the undeformed object.
     earlier : the states before, the latest first, and how long before the frame, seconds; one or two.
+    by_points : those of the same frames by the texture's points alone; empty where they are the same.
+    now : the state in the frame of which ``earlier`` are, where others move alike; None for each by itself.
     """
 
     camera: Camera
     centre: Array
     earlier: tuple[tuple[float, State], ...]
+    by_points: tuple[State, ...] = ()
+    now: State | None = None
+
+    @property
+    def of_points(self) -> RowMotion:
+        """The same, for a state by the texture's points alone."""
+        if not self.by_points:
+            return self
+        gaps = [gap for gap, _ in self.earlier]
+        return replace(self, earlier=tuple(zip(gaps, self.by_points, strict=True)), by_points=())
+
+    def moving_as(self, by_points: State) -> RowMotion:
+        """The same, for any state near that by the texture's points alone: the object moves as that does.
+
+        What an outline tells beside these is found anew in each frame, and its errors would pass for a motion.
+        """
+        return replace(self.of_points, now=by_points)
 
     def seconds(self, pixels: Array) -> Array:
         """When the rows of undistorted pixels (p, 2) are recorded, seconds (p,) after the middle row; NaN is 0."""
@@ -58,7 +79,7 @@ class RowMotion:
         state : in the frame.
         recorded : pixels, in the undistorted image.
         """
-        now, seconds = places(state), self.seconds(recorded)[:, None]
+        now, seconds = places(state if self.now is None else self.now), self.seconds(recorded)[:, None]
         (gap, last), *others = self.earlier
         velocity = (now - places(last)) / gap
         moved = velocity * seconds
@@ -76,7 +97,7 @@ class RowMotion:
         return moved
 
     def since_last(self, last: Array, recorded: Array) -> Array:
-        """Pixels (p, 2) at the middle row's instant of points that were at ``last`` (p, 2) in the last state.
+        """Pixels (p, 2) at the middle row's instant of points that were at ``last`` (p, 2) in the last state by them.
 
         Nothing needs to be known of the state in the frame: what was seen at ``recorded`` moved on evenly.
         """
@@ -115,6 +136,15 @@ def _motion(twist: Array, seconds: float) -> Array:
     return result
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """A frame's time, seconds, its state, and that by the texture's points alone."""
+
+    time: float
+    state: State
+    by_points: State
+
+
 class StateHistory:
     """Keeps the last states of an object, to tell how it moves in the next frame.
 
@@ -126,7 +156,7 @@ class StateHistory:
 
     def __init__(self, camera: Camera, centre: Array) -> None:
         self._camera, self._centre = camera, centre
-        self._states: deque[tuple[float, State]] = deque(maxlen=2)
+        self._states: deque[_Kept] = deque(maxlen=2)
         self._now: float | None = None
         self._not_used: ReadoutNotUsed | None = None
 
@@ -142,24 +172,36 @@ class StateHistory:
             self._not_used = ReadoutNotUsed()
         if not self._camera.readout_s or timestamp is None or not self._states:
             return None
-        gaps = np.array([timestamp - then for then, _ in self._states])
+        gaps = np.array([timestamp - kept.time for kept in self._states])
         between = np.diff(gaps, prepend=0.0)
         if not LEAST_GAP_S <= between[0] < MOST_GAP_S:
             self._not_used = ReadoutNotUsed(float(between[0]))
             return None
         n_used = 2 if len(gaps) == 2 and LEAST_GAP_S <= between[1] < MOST_GAP_S else 1
-        states = [state for _, state in self._states]
-        return RowMotion(self._camera, self._centre, tuple(zip(gaps[:n_used].tolist(), states[:n_used], strict=True)))
+        used = list(self._states)[:n_used]
+        earlier = tuple(zip(gaps[:n_used].tolist(), [kept.state for kept in used], strict=True))
+        return RowMotion(self._camera, self._centre, earlier, tuple(kept.by_points for kept in used))
 
-    def add(self, state: State | None) -> None:
-        """Take in the state in the frame that was asked for last; None where it is not known."""
+    def add(self, state: State | None, by_points: State | None = None) -> None:
+        """Take in the state in the frame that was asked for last; None where it is not known.
+
+        ``by_points`` : that by the texture's points alone; None where it is the same.
+        """
         if state is None or self._now is None:
             self._states.clear()
         elif self._camera.readout_s:
-            self._states.appendleft((self._now, state))
+            self._states.appendleft(_Kept(self._now, state, by_points or state))
 
     def replace_last(self, state: State) -> None:
         """Take in that the last frame's state is known better, or is known."""
-        if self._states:
-            self._states.popleft()
-        self.add(state)
+        self.add(state, self._states.popleft().by_points if self._states else None)
+
+    def change_points(self, by_points: State | None) -> None:
+        """Take in that other points are followed from now on.
+
+        ``by_points`` : the last frame's state by these alone; None where the states so far have bound them.
+        """
+        if by_points is not None and self._states:
+            self._states = deque([replace(self._states[0], by_points=by_points)], maxlen=2)
+        else:
+            self._states = deque([replace(kept, by_points=kept.state) for kept in self._states], maxlen=2)

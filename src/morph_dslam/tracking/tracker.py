@@ -161,7 +161,7 @@ class Tracker:
         self.last_correction: ReferenceCorrection | None = None
         self.last_doubt_px = 0.0
         self._views: ViewSet | None = None
-        self._last = self._velocity_base = self._start = registration.state
+        self._last = self._last_by_points = self._velocity_base = self._start = registration.state
         self._jumps_before: tuple[DisplacementJump, ...] = ()
         if reference is not None and not isinstance(reference, Image):
             reference = Picture.of(reference, camera).made_ready(self._undistortion)
@@ -290,8 +290,8 @@ class Tracker:
             rows = np.flatnonzero(self._supported)
             count = min(max(FOLLOWED_A_UNKNOWN * len(self.estimator.scale), LEAST_FOLLOWED), MOST_FOLLOWED, len(rows))
             rows = rows[evenly(len(rows), count)]
-            last = self.reference.projected(self._last)
-            guesses = self._pixels + self._expected_motion(last, prior)
+            guesses = self._pixels + self._expected_motion(self.reference.projected(self._last), prior)
+            last = self.reference.projected(self._last_by_points)
             # Half of the size is exact enough for a start.
             found, ok = follow(self._image.half, image.half, 0.5 * self._pixels[rows], 0.5 * guesses[rows], LEVELS - 1)
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
@@ -366,6 +366,8 @@ class Tracker:
         estimation.weigh_known(hypothesis)
         with stage("search"):  # of one that was found otherwise than by `_search`, too
             hypothesis = estimation.in_likelier_tilt(hypothesis)
+        if not hypothesis.outline_alone:
+            hypothesis = replace(hypothesis, by_points=hypothesis.estimate.state)
         with stage("outline"):
             hypothesis = estimation.fit_outline(image, hypothesis, self._view.systematic)
         with stage("depth"):
@@ -387,7 +389,7 @@ class Tracker:
             with stage("correct"):
                 systematic = None if self._view.number or not self._in_sequence else self._view.systematic
                 warped = None if systematic is None else systematic.warped
-                hypothesis = estimation.with_blur(image, hypothesis, self._last, warped)
+                hypothesis = estimation.with_blur(image, hypothesis, self._last_by_points, warped)
         self.last_blurred, self.last_correction = hypothesis.blurred, hypothesis.correction
         if camera.pose_prior is not None and not hypothesis.outline_alone:
             self._anchoring.note(self._anchoring.contradicts(camera.pose_prior, hypothesis))
@@ -406,7 +408,7 @@ class Tracker:
             self._forget_loads()
             placed = self._placed_by_map(camera)
             if placed is not None:
-                self._last = replace(self._last, camera_from_object=placed.pose)
+                self._last = self._last_by_points = replace(self._last, camera_from_object=placed.pose)
             self._history.add(None if placed is None else self._last)
         self._image, self._lost = image, rejection is not None
         self._n_lost = self._n_lost + 1 if self._lost else 0
@@ -488,13 +490,18 @@ class Tracker:
         start : where the next frame's estimate starts; by default there.
         """
         self._last, self._start = state, start or state
+        if self._lost:
+            self._last_by_points = state
         self._history.replace_last(state)
         if self._views is not None:
-            self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
+            self._pixels = np.where(
+                self._supported[:, None], self._pixels, self.reference.projected(self._last_by_points)
+            )
 
     def take_over(self, other: Tracker) -> None:
         """Go on after the last frame of another tracker of the object, with what that knows but for the pose."""
         self.continue_from(replace(other.state, camera_from_object=self.state.camera_from_object))
+        self._last_by_points = self._last
         self.know_jumps(other.jumps)
         self.estimator.known.take(other.estimator.known)
         if self.estimator.loads is not None and other.estimator.loads is not None:
@@ -567,12 +574,12 @@ class Tracker:
                 depth = middle(self.reference.points.in_camera(estimate.state)[:, 2])
                 self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
         self._velocity_base = estimate.state if self._lost else self._last
-        self._last = estimate.state
-        self._history.add(self._last)
+        self._last, self._last_by_points = estimate.state, hypothesis.points_state
+        self._history.add(self._last, self._last_by_points)
         angles = self._registration.per_sequence
         self._start = next_start(estimate, self._velocity_base, self.model, self.options, angles)
         self._supported = inliers
-        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last))
+        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last_by_points))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis, image)
         if not self._lost:
@@ -597,4 +604,6 @@ class Tracker:
             change.view.systematic.forget_frames()
         self._views.active, self._anchoring.reference = change.view, change.view.reference
         self._supported, self._pixels = change.supported, change.pixels
+        self._last_by_points = change.by_points or self._last
+        self._history.change_points(change.by_points)
         return change

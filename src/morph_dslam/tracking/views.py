@@ -293,12 +293,14 @@ class Change:
     supported : (p,) which of its points to follow from this frame on.
     pixels : (p, 2) where they are.
     is_new : whether it was followed never before.
+    by_points : the frame's state by its points alone; None where nothing tells it, or it is the one that was found.
     """
 
     view: ActiveView
     supported: NDArray[np.bool_]
     pixels: Array
     is_new: bool = False
+    by_points: State | None = None
 
 
 @dataclass(frozen=True)
@@ -414,11 +416,15 @@ class ViewSet:
 
     def _tried(self, view: ActiveView, picture: Image, attempt: PoseHypothesis) -> Change | None:
         """A change to a view that is kept, if the frame agrees with it."""
+        if picture.motion is not None:  # what other points were off by is none of its points'
+            picture = replace(picture, motion=replace(picture.motion, by_points=()))
         found = view.estimation.correct(picture, attempt.estimate.state, None, attempt.prior)
         if reject(found, self._options) is not None:
             return None
-        places = view.reference.projected(found.estimate.state)
-        return Change(view, found.inliers, np.where(found.inliers[:, None], found.measurement.recorded, places))
+        state = found.estimate.state
+        places = view.reference.projected(state)
+        pixels = np.where(found.inliers[:, None], found.measurement.recorded, places)
+        return Change(view, found.inliers, pixels, by_points=state)
 
     def _begin(
         self, picture: Image, attempt: PoseHypothesis, stated: Estimate, unexplained_px: float, now: Array
