@@ -360,7 +360,7 @@ def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_es
         off += (z - told @ information @ covariance) @ moves[camera].T
         nothing = np.zeros(0)
         corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
-    errors, plain = RigErrors(trackers, RIG, [0.0, 0.0]), replace(before, covariance=np.zeros((9, 9)))
+    errors, plain = RigErrors(trackers, RIG, [CommonDepthScale()] * 2), replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
     scales = np.outer(estimator.scale, estimator.scale)
     drawn = np.cov(off.T) / scales
