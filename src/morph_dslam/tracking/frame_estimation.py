@@ -13,6 +13,7 @@ from morph_dslam.timing import stage
 from morph_dslam.tracking.compact_loads import LEAST_GAIN
 from morph_dslam.tracking.covariance import trace_of_share
 from morph_dslam.tracking.depth import PointDepths
+from morph_dslam.tracking.depth_weight import weighed_by_residuals
 from morph_dslam.tracking.estimator import Estimate, Estimator, Prior, State
 from morph_dslam.tracking.frame_starts import ShapeSearch
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -528,6 +529,7 @@ class FrameEstimation:
         if self._makes_good(systematic, self._depth_check):
             found, minimum = self._corrected(attempt, attempt.estimate.state, systematic, self._scout)
             for _ in range(DEPTH_ROUNDS - 1):
+                found = replace(found, depths=self._weighed(replace(found, depths=attempt.depths), minimum.state))
                 found, minimum = self._corrected(found, minimum.state, systematic, self._estimator)
             found = replace(found, estimate=self._finished(found, minimum))
             # Nothing was learnt with the correction, so that one frame can do without.
@@ -535,6 +537,15 @@ class FrameEstimation:
                 return found
         seen = self.measured(attempt, correlated=False)
         return replace(attempt, estimate=self._estimator.fit(seen, attempt.estimate.state, attempt.prior))
+
+    def _weighed(self, attempt: PoseHypothesis, state: State) -> PointDepths:
+        """The depths of an attempt by what they show in a state that they are off by, once they are corrected."""
+        corrected, pixels = attempt.corrected_depths, attempt.measurement.pixels
+        assert corrected is not None
+        assert attempt.depths is not None
+        residuals = corrected.linearised(self._reference.points, state)[0]
+        seen = weighed_by_residuals(corrected, residuals, pixels).padded(len(attempt.depths.depths))
+        return replace(seen, depths=attempt.depths.depths)
 
     def with_blur(
         self, picture: Image, attempt: PoseHypothesis, last: State, warped: Callable[[State, Array], Array] | None
