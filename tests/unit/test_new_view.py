@@ -62,7 +62,7 @@ def fit(view, made, attempt, unexplained_px=0.1, spread=0.01, **changed):
     estimate = replace(attempt.estimate, **changed)
     attempt, half = replace(attempt, estimate=estimate), PATCH_HALF
     known = is_known_well(attempt, spread, unexplained_px, OPTIONS)
-    return known and is_sharp(made, attempt, view.rendered(estimate.state), half)
+    return known and is_sharp(made, attempt, view, half)
 
 
 def test_a_sharp_frame_whose_state_is_known_is_fit(scene):
@@ -101,6 +101,16 @@ def test_a_blurred_frame_is_not(scene):
     assert not fit(view, blurred, tried)
     everywhere = np.ones(made.normalized.shape, dtype=bool)
     assert sharpness(blurred.normalized, everywhere) < 0.8 * sharpness(made.normalized, everywhere)
+
+
+def test_a_frame_is_as_sharp_as_the_view_where_its_points_have_the_texture(scene):
+    """An outline may have placed the object elsewhere, here twice as far, where the view's texture is finer."""
+    film, view, attempt = scene
+    made, tried = attempt(film.frame(NOW))
+    pose = tried.estimate.state.camera_from_object
+    farther = replace(NOW, camera_from_object=RigidTransform(pose.rotation, 2.0 * pose.translation))
+    assert not fit(view, made, tried, state=farther)
+    assert fit(view, made, replace(tried, by_points=tried.estimate.state), state=farther)
 
 
 def test_nothing_is_bound_around_points_that_disagree_or_behind_another_object(scene):

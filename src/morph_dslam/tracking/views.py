@@ -66,15 +66,16 @@ def is_known_well(attempt: PoseHypothesis, spread: float, unexplained_px: float,
     return spread < LARGEST_SPREAD
 
 
-def is_sharp(picture: Image, attempt: PoseHypothesis, should_be: Rendering, half: int) -> bool:
-    """Whether a frame is as sharp as the view that it was compared with.
+def is_sharp(picture: Image, attempt: PoseHypothesis, view: ReferenceView, half: int) -> bool:
+    """Whether a frame is as sharp as the view that it was compared with, where its points have that view's texture.
 
     Parameters
     ----------
-    should_be : that view in the state of the attempt.
+    attempt : made against ``view``.
     half : of the side of the squares about points in which sharpness is compared, pixels.
     """
     near = around(picture, attempt.measurement.pixels[attempt.inliers], half)
+    should_be = view.rendered(attempt.points_state)
     return sharpness(picture.normalized, near) > LEAST_SHARPNESS * sharpness(should_be.image, near)
 
 
@@ -438,10 +439,9 @@ class ViewSet:
         if not is_known_well(attempt, spread / self._size, unexplained_px, options):
             return None
         picture = self._of_one_instant(picture, stated.state)
-        should_be = old.rendered(stated.state)
-        if not is_sharp(picture, attempt, should_be, PATCH_HALF):
+        if not is_sharp(picture, attempt, old, PATCH_HALF):
             return None
-        seen = seen_part(picture, attempt, should_be, old)
+        seen = seen_part(picture, attempt, old.rendered(stated.state), old)
         try:
             error_factors = error_factors_of(stated.covariance, estimator.scale)
             view = PosedImage(picture, stated.state, error_factors, seen, attempt.discrepancy)
