@@ -31,6 +31,8 @@ MOST_WIDE = 400
 MOST_PLACES, LEAST_ALIKE, SHARE_OF_BEST = 9, 0.2, 0.5
 #: Within so many pixels of the halved images two places are one.
 APART = 3
+#: Single precision makes a correlation larger than one by no more than this.
+ROUNDING = 1e-3
 
 
 class Relocalizer:
@@ -152,7 +154,8 @@ def matching_shifts(frame: NDArray[np.uint8], rendering: Rendering) -> Array:
 def _correlation(field: MatLike, shown: MatLike, covered: MatLike) -> NDArray[np.float32]:
     """Normalized cross-correlation of what is shown with every place of a field, where it is covered alone.
 
-    A place that has no contrast correlates with nothing.
+    A place that has no contrast correlates with nothing: there OpenCV divides rounding errors by each other.
     """
     found = cv2.matchTemplate(field, shown, cv2.TM_CCOEFF_NORMED, mask=covered)
-    return np.where(np.isfinite(found) & (np.abs(found) <= 1.0), found, 0.0).astype(np.float32)
+    known = np.isfinite(found) & (np.abs(found) <= 1.0 + ROUNDING)
+    return np.clip(np.where(known, found, 0.0), -1.0, 1.0).astype(np.float32)
