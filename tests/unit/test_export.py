@@ -535,9 +535,10 @@ def test_a_folder_that_cannot_be_written_is_refused(folder, tmp_path, refused):
     assert "cannot write to" in refused("export", folder / "block.morph", "-o", tmp_path / "file" / "out")
 
 
-def test_an_earlier_export_of_a_model_with_an_ampersand_is_replaced(tmp_path):
-    file = tmp_path / "R&D.morph"
+@pytest.mark.parametrize("name", ["R&D", '2" pipe', "a<b"])
+def test_an_earlier_export_of_a_model_whose_name_xml_writes_otherwise_is_replaced(tmp_path, name):
+    file = tmp_path / f"{name}.morph"
     save_model(file, stretched_block_model())
     for count in (6, 2):
         export(file, tmp_path / "out", "vtu", StateChoice(vary=[f"slide=-1:1:{count}"]))
-    assert sorted(path.name for path in (tmp_path / "out").glob("*.vtu")) == ["R&D_0000.vtu", "R&D_0001.vtu"]
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.vtu")) == [f"{name}_0000.vtu", f"{name}_0001.vtu"]

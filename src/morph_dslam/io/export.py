@@ -136,9 +136,9 @@ _HEAD = 4096
 def _earlier_export(folder: Path, stem: str) -> list[Path]:
     """What an export of this name has written, in any format, and others have not."""
     series, collection, animation = (folder / f"{stem}.{ending}" for ending in ("xdmf", "pvd", "glb"))
-    name = re.escape(escape(stem))
-    own = rf'file="({name}_(?:{_INNER}[\w.+-]+_)?\d{{4,}}\.vtu)"'
-    written = [folder / unescape(name) for name in re.findall(own, _beginning(collection))]
+    own = re.compile(rf"{re.escape(stem)}_(?:{_INNER}[\w.+-]+_)?\d{{4,}}\.vtu")
+    named = [unescape(name, {"&quot;": '"'}) for name in re.findall('file="([^"]*)"', _beginning(collection))]
+    written = [folder / name for name in named if own.fullmatch(name)]
     found = [*written, collection] if written else []
     head = _beginning(series, _HEAD)
     data = series.with_suffix(".h5")
