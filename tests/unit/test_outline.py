@@ -126,9 +126,10 @@ def test_the_outline_of_a_shaded_ball_is_where_it_turns_away(ground):
     radii = np.hypot(*(seen.pixels[seen.valid] - [320.0, 240.0]).T)
     errors = radii - 520.0 * radius / np.sqrt(distance**2 - radius**2)
     # The steepest place is off by 0.9 pixels, and by 2.8 on the ground that the surface is as bright as within the rim.
+    # What is known less well than to half a pixel is left out, so that few errors are larger than twice that.
     assert seen.valid.sum() > 0.5 * seen.expected.sum() > 50
-    assert abs(np.median(errors)) < 0.4
-    assert np.percentile(np.abs(errors), 95) < 0.8
+    assert abs(np.mean(errors)) < 0.2
+    assert np.percentile(np.abs(errors), 95) < 1.1
 
 
 def test_the_rims_of_a_hole_and_what_lies_behind_it_count_as_they_are_seen():

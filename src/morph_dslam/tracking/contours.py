@@ -25,6 +25,8 @@ OUTSIDE_PX, INSIDE_PX = (1.5, 3.0), 3.0
 JUMP_SHARE, JUMP_PX = 0.01, 2.0
 #: Cosine of the angle between two triangles' normals across an edge that is only the mesh's and not the body's.
 SMOOTH = 0.75
+#: How far inwards of the contour, which is itself drawn to half a pixel, the object is looked for, pixels: from and to.
+FIRST_PX, FARTHEST_PX = 2, 9
 #: Points of nearly parallel stretches of the contour count as neighbours: cosine of the angle between their normals.
 PARALLEL = 0.5
 
@@ -71,12 +73,14 @@ class Contour:
     pixels : (k, 2) where they are seen
     normals : (k, 2) across the contour, outwards.
     turns_away : (k,) whether a smooth surface turns away there; it ends, or has a sharp edge, elsewhere.
+    width : (k,) how far the object goes on inwards before nothing of it is seen; infinite beyond `FARTHEST_PX`.
     """
 
     points: SurfacePoints
     pixels: Array
     normals: Array
     turns_away: NDArray[np.bool_]
+    width: Array
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -113,7 +117,25 @@ def find_contour(
     weights[every, edges.corners[rows, 0]] = 1.0 - shares
     weights[every, edges.corners[rows, 1]] = shares
     points = SurfacePoints(edges.triangles[rows], weights)
-    return Contour(points, places[chosen], normals[chosen], turns_away[chosen])
+    width = _widths(places[chosen], normals[chosen], depth)
+    return Contour(points, places[chosen], normals[chosen], turns_away[chosen], width)
+
+
+@njit(cache=True, nogil=True)
+def _widths(places, normals, depth):
+    """How far (k,) from places (k, 2) against their normals (k, 2) the first pixel is in which nothing was drawn."""
+    height, width = depth.shape
+    result = np.full(len(places), np.inf)
+    for j in range(len(places)):
+        for away in range(FIRST_PX, FARTHEST_PX + 1):
+            column = int(np.rint(places[j, 0] - away * normals[j, 0]))
+            row = int(np.rint(places[j, 1] - away * normals[j, 1]))
+            if not (0 <= column < width and 0 <= row < height):
+                break
+            if np.isinf(depth[row, column]):
+                result[j] = away - 0.5
+                break
+    return result
 
 
 @njit(cache=True, nogil=True)

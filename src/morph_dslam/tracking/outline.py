@@ -21,7 +21,7 @@ from morph_dslam.model import ReducedModel, SurfacePoints
 from morph_dslam.render.rasteriser import draw_depth
 from morph_dslam.tracking.binding import Drawing, DrawnSurface, View, view_of
 from morph_dslam.tracking.contours import Contour, SurfaceEdges, find_contour
-from morph_dslam.tracking.edge_profiles import LIKELY_LEVELS, SIDE_PX, search_outline
+from morph_dslam.tracking.edge_profiles import BLUR_PX, LIKELY_LEVELS, SIDE_PX, search_outline
 from morph_dslam.tracking.estimator import BoundPoints, State
 from morph_dslam.tracking.row_motion import RowMotion
 
@@ -32,6 +32,8 @@ N_POINTS = 160
 REACH_PX = 14
 #: While its points move by less than this, pixels, the contour is looked for along the same points of the surface.
 SAME_CONTOUR_PX = 8.0
+#: How often the first picture is searched: its blur is known better each time.
+FIRST_ROUNDS = 4
 #: What is beside an outline: from and up to so many pixels off, within so many median deviations, by so many points.
 BESIDE_PX, SPREADS, FEWEST_KNOWN = (4, 9), 4.5, 12
 
@@ -135,6 +137,7 @@ class Outline:
         self.points = BoundPoints.from_surface(model, slots)
         self._used = np.zeros(N_POINTS, dtype=bool)
         self._picture: _Picture | None = None
+        self._blur: float | None = None
 
     @property
     def knows_brightness(self) -> bool:
@@ -230,8 +233,12 @@ class Outline:
         Points stay in the places of those that were near them last: what one errs by is then known as the same.
         """
         slots, normals_there = self._slots, self._contour.normals
-        shown, turns_away = places + drift, self._contour.turns_away
-        offsets = np.asarray(search_outline(grey, shown, normals_there, turns_away, self._beside, reach))
+        contour, offsets = self._contour, np.full(len(slots), np.nan)
+        asked = grey, places + drift, normals_there, contour.turns_away, contour.width, self._beside, reach
+        blur, rounds = (BLUR_PX, FIRST_ROUNDS) if self._blur is None else (self._blur, 1)
+        for _ in range(rounds):
+            offsets, blur = search_outline(*asked, blur)
+        self._blur = blur
         found = np.zeros(N_POINTS)
         found[slots] = is_found = np.isfinite(offsets)
         pixels, normals = np.zeros((N_POINTS, 2)), np.zeros((N_POINTS, 2))
