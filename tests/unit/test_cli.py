@@ -53,25 +53,17 @@ def test_help_and_version_need_no_heavy_import():
         assert "morph" in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status"),
-    [
-        (["info", "sheet.morph"], 0),
-        (["info", "absent.morph"], 2),
-        (["track", "film", "--camera", "c.yaml", "--model", "absent.morph", "--landmarks", "l.csv", "-o", "run"], 2),
-    ],
-)
-def test_a_summary_or_a_missing_file_needs_nothing_that_builds_or_draws(tmp_path, arguments, status):
+def test_a_summary_or_a_missing_file_needs_nothing_that_builds_or_draws(tmp_path):
     save_model(tmp_path / "sheet.morph", bent_sheet_model(9, 7))
     program = (
         "import sys; from morph_dslam.cli import main\n"
-        "status = main(sys.argv[1:])\n"
-        "heavy = {'ngsolve', 'netgen', 'matplotlib', 'scipy.stats', 'scipy.signal'} & sys.modules.keys()\n"
-        "assert not heavy, heavy\n"
-        "sys.exit(status)"
+        "words = '--camera c.yaml --model absent.morph --landmarks l.csv -o run'.split()\n"
+        "commands = ['info', 'sheet.morph'], ['info', 'absent.morph'], ['track', 'film', *words]\n"
+        "print(*(main(command) for command in commands))\n"
+        "print(*{'ngsolve', 'netgen', 'matplotlib', 'scipy.stats', 'scipy.signal'} & sys.modules.keys())\n"
     )
-    done = subprocess.run([sys.executable, "-c", program, *arguments], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == status, done.stderr
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-2:] == ["0 2 2", ""]
 
 
 def test_output_that_nobody_reads_any_more_ends_quietly(tmp_path):
@@ -284,8 +276,8 @@ def test_an_interrupt_is_not_lost_where_errors_cannot_be_raised(number, capsys):
 
 
 def test_progress_in_a_log_is_a_line_in_ten_seconds():
-    code = "from morph_dslam.cli import main; main(['info', 'absent.morph'])"
-    code += "; import tqdm; print(tqdm.tqdm([]).mininterval)"
+    code = "from morph_dslam.cli import main\ntry: main(['dance'])\nexcept SystemExit: pass\n"
+    code += "import tqdm; print(tqdm.tqdm([]).mininterval)"
     known = {name: value for name, value in os.environ.items() if not name.startswith("TQDM_")}
     for given, interval in (({}, 10.0), ({"TQDM_MININTERVAL": "3"}, 3.0)):
         run = subprocess.run(
