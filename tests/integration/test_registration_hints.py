@@ -57,8 +57,22 @@ def scene(scan):
 
 
 @pytest.fixture(scope="module")
-def unhinted(scene):
-    return register(scene, bending_wedge())
+def searched(scene):
+    """A registration without hints, and the places that its search found by edges."""
+    found, search = [], EdgeSearch.search
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EdgeSearch, "search", lambda self: found.append(search(self)) or found[-1])
+        return register(scene, bending_wedge()), found[0]
+
+
+@pytest.fixture(scope="module")
+def unhinted(searched):
+    return searched[0]
+
+
+@pytest.fixture(scope="module")
+def places(searched):
+    return searched[1]
 
 
 def seen(view, points):
@@ -75,6 +89,12 @@ def box_with(margin, pixels):
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     aside = margin * (high - low)
     return (*(low - aside).tolist(), *(high + aside).tolist())
+
+
+def test_an_object_without_texture_is_found_by_its_edges(unhinted):
+    assert not unhinted.ambiguous
+    assert apart(unhinted) < 1.5e-3
+    assert unhinted.map_registration.world_from_object.scale == pytest.approx(WORLD.scale, rel=0.01)
 
 
 @pytest.mark.slow
@@ -185,12 +205,6 @@ def reason(scan, monkeypatch, places, views=None):
     monkeypatch.setattr(EdgeSearch, "search", lambda self: places)
     points, all_views = scan
     return register_mesh(NODES, TRIANGLES, points, views or all_views, CAMERA).unrefined
-
-
-@pytest.fixture(scope="module")
-def places(scan):
-    points, views = scan
-    return EdgeSearch(NODES, TRIANGLES, points, views, CAMERA, metric=False).search()
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ def apart(found, true, nodes):
     return np.linalg.norm((true.inverse @ found).apply(nodes) - nodes, axis=1).max()
 
 
+@pytest.mark.slow
 def test_a_wedge_on_a_table_is_found_in_a_map_of_unknown_scale():
     nodes, triangles, _ = wedge()
     points, views = scanned(WORLD)
