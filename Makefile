@@ -7,6 +7,7 @@ SHELL := bash
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed.stamp
+TYPES := $(VENV)/types.stamp
 LOWEST := .venv-lowest
 
 # The first interpreter that is new enough and can make virtual environments.
@@ -54,11 +55,15 @@ test-lowest:
 bench: $(INSTALLED)
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
 
-lint: $(INSTALLED)
+lint: $(INSTALLED) $(TYPES)
 	@$(BIN)/ruff format --check --quiet
 	@$(BIN)/ruff check --quiet
-	@$(BIN)/pyright --warnings
 	@$(BIN)/lint-imports
+
+# Types are checked where a module has changed, come or gone since they were found right: that takes minutes.
+$(TYPES): $(INSTALLED) $(shell find src -name '*.py' -o -type d -not -name __pycache__)
+	@$(BIN)/pyright --warnings
+	@touch $@
 
 # The site, in build/site: open build/site/index.html. Pictures of the studio follow its pages where Chromium is present.
 docs: $(INSTALLED)
