@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from morph_dslam.cli.app import main
+from morph_dslam.mechanics.materials.base import registered_laws
+from morph_dslam.studies.executors import default_executor
 from tests.support.block_study import write_study
 
 LAW = '''
@@ -70,6 +73,15 @@ def test_workers_know_the_laws_of_files_that_a_script_imports(tmp_path: Path) ->
     assert ended.returncode == 0, ended.stderr
 
 
+def test_a_worker_knows_a_law_that_this_process_has_imported(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "quick_law.py").write_text(LAW.replace("softened", "quickly softened"))
+    monkeypatch.syspath_prepend(tmp_path)
+    law = import_module("quick_law").Softened
+    with default_executor(2) as executor:
+        assert executor.submit(registered_laws).result()["quickly softened"] is law
+
+
+@pytest.mark.slow
 def test_workers_know_the_laws_of_a_script_with_a_main_guard(tmp_path: Path) -> None:
     write_study(tmp_path, SOFTENED)
     ended = run(tmp_path, f'{LAW}\nimport morph_dslam as md\nif __name__ == "__main__":\n    {BUILD}')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -13,10 +14,13 @@ import numpy as np
 import pytest
 
 from morph_dslam.cli.app import INTERRUPTED, main
+from morph_dslam.studies.build import build
+from morph_dslam.studies.executors import SerialExecutor
 from morph_dslam.studies.snapshots import PARTIAL
 from tests.support.block_study import write_study
 
 N_SAMPLES = 30
+KEPT = "the solutions found so far, if any, are kept, and the same command goes on from there"
 #: Stopped while workers send results that are long in the pipe.
 STOPPED_WHILE_SENDING = """
 import time
@@ -69,11 +73,30 @@ def nothing_left(group: int) -> bool:
 def alone(tmp_path_factory) -> bytes:
     """The model file of a build that nothing disturbed, in one process."""
     folder = tmp_path_factory.mktemp("alone")
-    assert main(["build", str(write_study(folder)), "-o", str(folder / "block.morph")]) == 0
+    build(write_study(folder), folder / "block.morph")
     return (folder / "block.morph").read_bytes()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("interruptible")
+def test_a_build_in_one_process_that_is_stopped_goes_on_from_there(alone, tmp_path, monkeypatch, capsys) -> None:
+    study, output = write_study(tmp_path), tmp_path / "block.morph"
+    submit, numbers = SerialExecutor.submit, itertools.count(1)
+
+    def stopped(self, *task, **options):
+        if next(numbers) == 4:
+            signal.raise_signal(signal.SIGINT)
+        return submit(self, *task, **options)
+
+    monkeypatch.setattr(SerialExecutor, "submit", stopped)
+    assert main(["build", str(study), "-o", str(output)]) == INTERRUPTED
+    assert capsys.readouterr().err.splitlines()[-1] == f"morph: interrupted; {KEPT}"
+    assert 3 <= len(solved(output)) < N_SAMPLES
+    assert main(["build", str(study), "-o", str(output)]) == 0
+    assert output.read_bytes() == alone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, tmp_path: Path) -> None:
     """Ctrl-C reaches the whole group, SIGTERM of a batch system the main process alone."""
     study, output = write_study(tmp_path), tmp_path / "block.morph"
@@ -88,8 +111,7 @@ def test_a_stopped_build_keeps_what_it_solved_and_says_so(number, alone: bytes, 
     assert process.returncode == INTERRUPTED
     assert "Traceback" not in message
     said = message.splitlines()[-1]
-    kept = "the solutions found so far, if any, are kept, and the same command goes on from there"
-    assert said == f"morph: interrupted; {kept}"
+    assert said == f"morph: interrupted; {KEPT}"
     wait_until(lambda: nothing_left(process.pid))
     assert 3 <= len(solved(output)) < N_SAMPLES
     assert main(["build", str(study), "-o", str(output)]) == 0
