@@ -105,7 +105,7 @@ def test_a_fold_through_points_on_an_arc_stays_on_it():
         np.testing.assert_allclose(np.hypot(r[nodes], z[nodes]), radius, rtol=2e-4)
 
 
-@pytest.mark.parametrize(("name", "nodes"), [("hex8", 25795), ("hex20", 95711)])
+@pytest.mark.parametrize(("name", "nodes"), [("hex8", 25795), pytest.param("hex20", 95711, marks=pytest.mark.slow)])
 def test_the_boot_seal_has_the_papers_nodes_and_cells(name, nodes):
     mesh = revolution(
         1e-3 * np.array(BOOT), 1.5e-3, (91, 2, 77), name,

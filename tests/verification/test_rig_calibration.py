@@ -118,6 +118,7 @@ def test_what_cannot_be_a_rig_is_refused(filmed, tmp_path):
         calibrate_rig([[*sorted((filmed / "0").iterdir()), *sorted((filmed / "1").iterdir())]], MARKERS)
 
 
+@pytest.mark.slow
 def test_opencvs_stereo_pictures_give_the_pose_that_opencv_finds(tmp_path):
     folder, board = real_data("opencv_calib"), Board(9, 6, 0.025)
     pictures = [sorted(folder.glob(f"{side}??.jpg")) for side in ("left", "right")]

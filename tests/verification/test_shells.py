@@ -32,9 +32,9 @@ def test_cantilever_under_end_shear(cells):
 
 
 def test_hemisphere_with_a_hole():
-    shell = solved_shell(HEMISPHERE_STUDY.format(n=8, cells="quad9")).at(1.0)
+    shell = solved_shell(HEMISPHERE_STUDY.format(n=6, cells="quad9")).at(1.0)
     outwards, inwards = 1e3 * shell.displacement("outwards")[0], -1e3 * shell.displacement("inwards")[1]
-    np.testing.assert_allclose([outwards, inwards], HEMISPHERE[1.0], rtol=1e-2)
+    np.testing.assert_allclose([outwards, inwards], HEMISPHERE[1.0], rtol=2e-2)
 
 
 @pytest.mark.slow

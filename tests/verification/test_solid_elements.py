@@ -91,7 +91,13 @@ def _error(cell_type: str, n: int, mixed: bool | None) -> float:
     return float(np.sqrt(squares[0] / squares[1]))
 
 
-@pytest.mark.parametrize(("cell_type", "mixed"), VARIANTS)
+@pytest.mark.parametrize(
+    ("cell_type", "mixed"),
+    [
+        pytest.param(*variant, marks=[pytest.mark.slow] if variant in (("tet4", False), ("prism6", False)) else [])
+        for variant in VARIANTS
+    ],
+)
 def test_convergence_rate(cell_type: str, mixed: bool | None) -> None:
     """The error of the gradient falls as h^p with p the order of the cells."""
     coarse, fine = (4, 8) if type_of(cell_type).order == 1 else (3, 5)
