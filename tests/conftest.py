@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from morph_dslam.cli.app import main
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
@@ -24,6 +25,12 @@ from tests.support.rendered_anchored_rig import (
 )
 from tests.support.rendered_room import RoomFilm, hand_held, write_film
 
+#: What is in a figure that is not drawn.
+BLANK = {
+    "png": cv2.imencode(".png", np.full((8, 8), 255, dtype=np.uint8))[1].tobytes(),
+    "svg": b'<svg xmlns="http://www.w3.org/2000/svg"/>',
+}
+
 
 def pytest_configure(config):
     cv2.setNumThreads(1)
@@ -33,6 +40,43 @@ def pytest_collection_modifyitems(items):
     """Begin with one file that compiles the tracker, and with the mechanics, lest all workers compile the same."""
     first = ("tests/integration/test_anchored.py", "tests/verification/")
     items.sort(key=lambda item: next((k for k, start in enumerate(first) if item.nodeid.startswith(start)), len(first)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def blank_figures():
+    """Figures that tests have saved are blank: to draw those of a run takes longer than to track it.
+
+    Slow tests draw, and those that ask for `drawn_figures`. Gives the method that draws.
+    """
+    save = Figure.savefig
+
+    def save_blank(self, path, **options):
+        content = BLANK.get(options.get("format", str(path)[-3:]))
+        if content is None:
+            save(self, path, **options)
+        elif hasattr(path, "write"):
+            path.write(content)
+        else:
+            Path(path).write_bytes(content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", save_blank)
+        yield save
+
+
+@pytest.fixture(scope="module")
+def drawn_figures(blank_figures):
+    """Figures are drawn, from the first test or fixture of a file that asks for it to the end of the file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", blank_figures)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def figures_of_slow_tests(request, blank_figures, monkeypatch):
+    """Are drawn."""
+    if request.node.get_closest_marker("slow"):
+        monkeypatch.setattr(Figure, "savefig", blank_figures)
 
 
 @pytest.fixture

@@ -124,6 +124,7 @@ def print_texture(path):
     cv2.imwrite(str(path), np.clip(128.0 + 45.0 * image, 0, 255).astype(np.uint8))
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_a_hidden_structure_is_followed_through_a_rendered_recording(tmp_path, example):
     model = bending_block()
     save_model(tmp_path / "organ.morph", model)

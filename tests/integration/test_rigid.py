@@ -72,7 +72,7 @@ def test_the_pose_alone_is_tracked(folder, use_outline):
 
 
 @pytest.fixture(scope="module")
-def command(folder):
+def command(folder, drawn_figures):
     """Tracks the recording; the run is in the folder."""
     sequence = folder / "seq"
     assert main(["simulate", str(folder / "scene.toml"), "-o", str(sequence)]) == 0

@@ -243,7 +243,7 @@ def test_a_wrong_camera_is_found_out(tmp_path, room_film, term, given):
 
 
 def test_the_camera_is_refined_and_the_map_is_of_the_refined_one(tmp_path, room_film, capsys):
-    write_film(tmp_path, room_film[0], replace(CAMERA, fx=577.5, fy=577.5))
+    write_film(tmp_path, room_film[0][:50], replace(CAMERA, fx=577.5, fy=577.5))
     run, camera = tmp_path / "run", tmp_path / "camera.yaml"
     command = ["slam", str(tmp_path / "film"), "--camera", str(camera), "-o", str(run), "--no-video"]
     assert main([*command, "--refine-camera", "focal"]) == 0
@@ -329,6 +329,7 @@ def test_the_usual_focal_length_of_a_real_recording_is_not_called_wrong():
     assert wrong in ([], ["readout"])  # the recording's colour camera has a rolling shutter
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_writes_a_run_that_evaluate_reads(tmp_path, room_folder, capsys):
     run = tmp_path / "run"
     command = ["slam", str(room_folder / "film"), "--camera", str(room_folder / "camera.yaml"), "-o", str(run)]

@@ -48,7 +48,7 @@ def options(inputs, output, **changes):
 
 
 @pytest.fixture(scope="module")
-def finished(inputs, tmp_path_factory):
+def finished(inputs, tmp_path_factory, drawn_figures):
     folder = tmp_path_factory.mktemp("runs") / "run"
     return folder, track(options(inputs, folder))
 

@@ -20,6 +20,8 @@ from morph_dslam.render.shading import colour_table
 from tests.support.certified_block import certified_block_model
 from tests.support.stretched_block import PARAMETERS
 
+pytestmark = pytest.mark.usefixtures("drawn_figures")
+
 
 @pytest.fixture(scope="module")
 def model():
@@ -27,7 +29,7 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def page(model, tmp_path_factory):
+def page(model, tmp_path_factory, drawn_figures):
     path = tmp_path_factory.mktemp("report") / "block.report.html"
     write_build_report(path, model)
     assert list(path.parent.iterdir()) == [path]

@@ -63,6 +63,7 @@ def test_means_at_nodes_are_of_the_points_around_them(folder):
     assert np.median(means[seen]) == pytest.approx(0.0015, rel=0.05)  # half of the points have no error
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_prints_the_base_beside_the_error(folder, capsys):
     assert main(["evaluate", str(folder), "--depth", str(folder.parent / "depth.h5"), "--base-frame", "10"]) == 0
     line = capsys.readouterr().out.splitlines()[-1]

@@ -31,6 +31,7 @@ def run_and_truth(tmp_path):
     return run, tmp_path / "truth.npz"
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_evaluate_writes_figures_pictures_and_report_and_ends_with_the_result(run_and_truth, capsys):
     run, truth = run_and_truth
     assert main(["evaluate", str(run), "--points", str(truth), "--bind-frame", "10"]) == 0

@@ -209,6 +209,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_writes_figures_a_plot_and_a_section_of_the_report(folder, capsys):
     run = folder / "run"
     assert main(["evaluate", str(run), "--force", f"{folder / 'curve.csv'}:pull_mN", "--reaction", "clamp"]) == 0

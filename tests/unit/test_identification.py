@@ -582,6 +582,7 @@ def test_what_could_not_be_written_whole_is_no_identification(tmp_path: Path) ->
     assert not (tmp_path / "identification.json").exists()
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_writes_figures_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_model(tmp_path / "plate.morph", plate())
     places = np.linspace(0.0, 1.0, 9)

@@ -458,6 +458,7 @@ def write_table(path, kind, stretch, stress):
     return f"--{kind}={path}"
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_writes_a_section_that_a_study_reads(tmp_path, capsys):
     stretch = np.linspace(1.0, 2.5, 20)
     arguments = [

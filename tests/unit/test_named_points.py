@@ -240,6 +240,7 @@ def test_the_models_own_error_is_in_a_rotations_deviation():
     np.testing.assert_allclose(found.std, 1e-3 * 1e-6 / displaced, rtol=1e-3)
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_table_file_summary_and_plot_have_each_point(tmp_path, capsys):
     small = in_frame(MODEL, 0.5 * STATE, ROOT @ ROOT.T)
     places = [CORNER, ("middle", (0.0, 0.0, 0.0))]

@@ -239,6 +239,7 @@ def test_tracks_that_cannot_be_compared(pixels, frames, message):
         evaluate_pixels(sliding_run(), tracks(pixels, frames))
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_writes_figures_pictures_and_one_report_of_all_evaluations(tmp_path, capsys):
     run = tmp_path / "run"
     truth = exact_truth(write_run(run, ["tracked", "tracked", "lost", "tracked", "tracked", "tracked"]))

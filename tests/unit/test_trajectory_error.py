@@ -105,6 +105,7 @@ def test_clocks_that_do_not_meet():
         match(helix(), helix(start=0.0))
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_writes_figures_and_a_picture(tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()

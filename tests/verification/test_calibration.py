@@ -57,6 +57,7 @@ def test_corners_are_where_the_board_is(pictures):
         assert distances.max() < 0.3
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_command_finds_the_camera(pictures, tmp_path, capsys):
     folder = write_all(tmp_path / "images", pictures[0])
     output = folder / "cam.yaml"
@@ -275,7 +276,7 @@ def test_a_board_of_markers_that_is_not_there_or_described_twice(pictures, tmp_p
     assert "say how large a square of the checkerboard is" in refused(*command[:3], "8x6", *command[4:])
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("side", ["left", pytest.param("right", marks=pytest.mark.slow)])
 def test_opencvs_pictures_give_the_published_focal_length(side, tmp_path):
     folder = real_data("opencv_calib")
     calibration = calibrate(sorted(folder.glob(f"{side}??.jpg")), BOARD, tmp_path / "cam.yaml")
