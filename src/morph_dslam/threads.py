@@ -100,11 +100,13 @@ def threads_side_by_side() -> Iterator[None]:
     """Let the threads of this process take turns quickly, as long as they work on successive frames.
 
     OpenCV begins no threads of its own meanwhile. What exists already is left out when Python looks for
-    garbage: over all that has been imported that takes tens of milliseconds, in which no thread goes on.
+    garbage: over all that has been imported that takes tens of milliseconds, in which no thread goes on. A program that
+    has left some out itself (`gc.freeze`) has chosen: nothing is added to that, and nothing taken back.
     """
-    interval, threads = sys.getswitchinterval(), cv2.getNumThreads()
+    interval, threads, leaves_out = sys.getswitchinterval(), cv2.getNumThreads(), gc.get_freeze_count() == 0
     gc.collect()
-    gc.freeze()
+    if leaves_out:
+        gc.freeze()
     sys.setswitchinterval(SWITCH_INTERVAL)
     cv2.setNumThreads(1)
     try:
@@ -112,4 +114,5 @@ def threads_side_by_side() -> Iterator[None]:
     finally:
         cv2.setNumThreads(threads)
         sys.setswitchinterval(interval)
-        gc.unfreeze()
+        if leaves_out:
+            gc.unfreeze()

@@ -233,6 +233,26 @@ def test_names_that_are_no_cameras_and_ranges_of_cameras():
             open_source("fake:live")
 
 
+@pytest.fixture
+def nothing_frozen():
+    """The tests leave out all that they have imported when they look for garbage."""
+    gc.unfreeze()
+    yield
+    gc.freeze()
+
+
+@pytest.mark.usefixtures("nothing_frozen")
+def test_what_a_program_leaves_out_when_it_looks_for_garbage_is_its_own_choice():
+    first = [[]]  # what looks for garbage has a list of lists to look at
+    gc.freeze()
+    second = [[]]
+    with threads_side_by_side():
+        looked_at = [id(item) for item in gc.get_objects()]
+    assert (id(first) in looked_at, id(second) in looked_at) == (False, True)
+    assert gc.get_freeze_count() > 10_000
+
+
+@pytest.mark.usefixtures("nothing_frozen")
 def test_threads_take_turns_quickly_only_while_they_track():
     def settings():
         return sys.getswitchinterval(), cv2.getNumThreads(), gc.get_freeze_count()
