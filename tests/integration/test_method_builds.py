@@ -22,7 +22,7 @@ from morph_dslam.studies.sampling import training_samples
 from tests.support.block_study import STUDY, bent_block, write_study
 
 BLOCK = bent_block(["20 mm", "20 mm", "60 mm"], [2, 2, 6], 0.4, "25 deg", "5 mm") | {
-    "sampling": {"held_out": 6, "training": 24},
+    "sampling": {"held_out": 6, "training": 24, "refined": 0},
     "reduction": {"method": "reduced_basis", "tolerance": 1e-5},
 }
 
@@ -43,7 +43,7 @@ def test_a_reduced_basis_is_sampled_one_solve_at_a_time(tmp_path) -> None:
 def test_methods_reduce_the_same_solutions(tmp_path) -> None:
     errors = {}
     for method in ("galerkin", "pod", "sparse_pgd"):
-        sampling = {"scheme": "sobol", "training": 16, "held_out": 6}
+        sampling = {"scheme": "sobol", "training": 16, "held_out": 6, "refined": 0}
         study = BLOCK | {"sampling": sampling, "reduction": {"method": method, "max_degree": 4}}
         model = build(make_study(study), tmp_path / "block.morph")
         assert model.certificate["reduction"]["method"] == method
@@ -134,7 +134,9 @@ def test_reactions_of_a_model_balance_its_loads(tmp_path) -> None:
     ],
 )
 def test_a_wrong_choice_is_one_message(tmp_path, refused, line, words):
-    path = write_study(tmp_path, ("[sampling]\ntraining = 24\nheld_out = 6\n", ""), ('method = "pod"', line))
+    path = write_study(
+        tmp_path, ("[sampling]\ntraining = 24\nheld_out = 6\nrefined = 0\n", ""), ('method = "pod"', line)
+    )
     path.write_text(path.read_text().replace("max_degree = 2\n", ""))
     printed = refused("build", path, "-o", tmp_path / "x.morph")
     for word in words:

@@ -50,7 +50,7 @@ def tube_study(inner: str, outer: str, shape: list[dict]) -> SolidStudy:
             "shape": shape,
             "parameters": {"growth": {"range": ["-3 mm", "4 mm"]}},
             "solver": {"threads": 1},
-            "sampling": {"scheme": "even", "training": 8, "held_out": 4},
+            "sampling": {"scheme": "even", "training": 8, "held_out": 4, "refined": 0},
             "reduction": {"max_degree": 7, "tolerance": 1e-9},
         }
     )

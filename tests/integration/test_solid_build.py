@@ -51,6 +51,7 @@ threads = 1
 [sampling]
 training = 24
 held_out = 8
+refined = 0
 [reduction]
 max_degree = 5
 """
@@ -284,7 +285,8 @@ def test_uniaxial_stretch_reaches_the_closed_form_through_the_whole_chain(tmp_pa
     """E = 3 MPa, nu = 0.45, stretch 1.5: lateral stretch 0.830679, nominal stress 1.075843 MPa."""
     text = BLOCK[: BLOCK.index("[[supports]]")] + sliding(("x_min", "x"), ("y_min", "y"), ("z_min", "z"))
     text += '[[supports]]\nkind = "displacement"\non = "z_max"\nz = "80 mm * stretch"\n'
-    text += '[parameters.stretch]\nrange = [0.0, 0.6]\n[sampling]\nscheme = "even"\ntraining = 13\nheld_out = 5\n'
+    text += "[parameters.stretch]\nrange = [0.0, 0.6]\n"
+    text += '[sampling]\nscheme = "even"\ntraining = 13\nheld_out = 5\nrefined = 0\n'
     text += "[reduction]\nmax_degree = 10\ntolerance = 1e-7\n"
     (tmp_path / "study.toml").write_text(text)
     assert cli.main(["build", str(tmp_path / "study.toml"), "-o", str(tmp_path / "bar.morph")]) == 0
@@ -357,7 +359,7 @@ def test_a_load_past_its_limit_point_names_the_last_value_that_converged(tmp_pat
     text += sliding(("bottom", "z"), ("top", "z"), ("start", "y"), ("end", "x"))
     text += '[[loads]]\nkind = "pressure"\non = "inner"\npressure = "inside"\n'
     text += '[parameters.inside]\nrange = ["0 kPa", "150 kPa"]\n[solver]\nthreads = 1\n'
-    text += '[sampling]\nscheme = "even"\ntraining = 16\nheld_out = 4\n'
+    text += '[sampling]\nscheme = "even"\ntraining = 16\nheld_out = 4\nrefined = 0\n'
     (tmp_path / "study.toml").write_text(text)
     message = refused("build", tmp_path / "study.toml", "-o", tmp_path / "x.morph")
     found = re.search(r"inside could only be followed from 0 to ([\d.]+) kPa: no equilibrium found beyond", message)

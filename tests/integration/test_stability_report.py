@@ -37,6 +37,7 @@ threads = 1
 scheme = "even"
 training = 11
 held_out = 4
+refined = 0
 """
 #: Shortening at which a clamped column buckles: 4 pi^2 I / (A L^2), Euler.
 EULER = 4.0 * np.pi**2 * 10.0**2 / (12.0 * 150.0**2)

@@ -34,6 +34,7 @@ workers = 1
 [sampling]
 training = 24
 held_out = 6
+refined = 0
 [reduction]
 method = "pod"
 max_degree = 2

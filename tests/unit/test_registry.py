@@ -47,7 +47,7 @@ def test_a_method_of_ones_own_builds_a_model(registered, tmp_path, monkeypatch):
     content = tomllib.loads(STUDY) | {
         "parameters": {"pull": {"range": ["0 kPa", "20 kPa"]}, "push": {"range": ["-0.1 kPa", "0.1 kPa"]}},
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
-        "sampling": {"training": 8, "held_out": 4},
+        "sampling": {"training": 8, "held_out": 4, "refined": 0},
         "reduction": {"method": "planes"},
     }
     model = build(make_study(content))
@@ -97,7 +97,7 @@ def spoilt(change):
 )
 def test_what_a_method_returns_is_checked(registered, reduce, message):
     register_reduction("mine", reduce)
-    sampling = {"training": 8, "held_out": 4}
+    sampling = {"training": 8, "held_out": 4, "refined": 0}
     study = make_study(tomllib.loads(STUDY) | {"sampling": sampling, "reduction": {"method": "mine"}})
     with pytest.raises(StudyError, match=message):
         build(study)
