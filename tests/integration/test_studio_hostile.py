@@ -40,7 +40,7 @@ def studio(tmp_path_factory):
     """A client of a studio, its project folder, and the folder around it with a secret and a link to it."""
     around = tmp_path_factory.mktemp("hostile")
     (around / "secret.txt").write_bytes(SECRET)
-    with running_studio(around / "project") as server:
+    with running_studio(around / "project", takes_over=False) as server:
         (around / "project" / "link").symlink_to(around)
         client = Client(server)
         write_part(around / "part.inp")
@@ -163,7 +163,7 @@ def project(tmp_path_factory, whole_files):
     around = tmp_path_factory.mktemp("hostile")
     folder = around / "project"
     (around / "secret.txt").write_bytes(SECRET)
-    with running_studio(folder) as server:
+    with running_studio(folder, takes_over=False) as server:
         (folder / "link").symlink_to(around)
         client = Client(server)
         for (kind, name), content in whole_files.items():

@@ -41,7 +41,7 @@ def studio(tmp_path, film):
     folder.mkdir()
     save_model(folder / "model.morph", film[0])
     save_camera(folder / "camera.yaml", CAMERA)
-    with running_studio(folder) as server:
+    with running_studio(folder, takes_over=False) as server:
         yield Client(server), server, folder
 
 

@@ -6,8 +6,12 @@ import http.client
 import json
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any, ClassVar
+from unittest.mock import patch
 
 import numpy as np
 
@@ -55,22 +59,61 @@ def write_scene(folder):
     return folder / "scene.toml"
 
 
+class TakenOver:
+    """In place of the process that reads the files of a studio: one that the next studio takes over.
+
+    To start one takes longer than most tests of a studio. A studio that replaces it, as its process has died, has an
+    own one from then on.
+    """
+
+    options: ClassVar[dict[str, Any]] = {}
+    kept: ClassVar[ProcessPoolExecutor | None] = None
+
+    def __init__(self, count, **options):
+        type(self).options = {"max_workers": count, **options}
+        self._of_all = self.kept is not None
+        self._pool = self.kept if self._of_all else ProcessPoolExecutor(**self.options)
+
+    @classmethod
+    def start(cls):
+        """Start the process before the studio does, which ends what it has started."""
+        if cls.options and cls.kept is None:
+            cls.kept = ProcessPoolExecutor(**cls.options)
+            cls.kept.submit(int)
+
+    def submit(self, function, *arguments):
+        self._last = self._pool.submit(function, *arguments)
+        return self._last
+
+    def shutdown(self, **options):
+        last = self._last
+        works = last.done() and not last.cancelled() and not isinstance(last.exception(), BrokenProcessPool)
+        if self._of_all and works:
+            return
+        if self._of_all:
+            type(self).kept = None
+        self._pool.shutdown(**options)
+
+
 @contextmanager
-def running_studio(folder, phone=False):
-    """A studio that answers as long as the context lasts."""
-    server = StudioServer(folder, port=0, phone=phone)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    end = time.monotonic() + 30
-    while not server.started:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    try:
-        yield server
-    finally:
-        server.stop()
-        thread.join(30)
-        assert not thread.is_alive()
+def running_studio(folder, phone=False, takes_over=True):
+    """A studio that answers as long as the context lasts; unless it ``takes_over`` a process, it has an own one."""
+    if takes_over:
+        TakenOver.start()
+    with patch("morph_dslam.studio.worker.ProcessPoolExecutor", TakenOver if takes_over else ProcessPoolExecutor):
+        server = StudioServer(folder, port=0, phone=phone)
+        thread = threading.Thread(target=server.run, daemon=True)
+        thread.start()
+        end = time.monotonic() + 30
+        while not server.started:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        try:
+            yield server
+        finally:
+            server.stop()
+            thread.join(30)
+            assert not thread.is_alive()
 
 
 class Client:
@@ -91,7 +134,7 @@ class Client:
 
     def ask(self, method, path, body=None, **headers):
         """Status, headers and content of an answer; a header that is None is left out."""
-        connection = http.client.HTTPConnection("127.0.0.1", self._server.port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self._server.port, timeout=300)
         sent = {name: value for name, value in (self.own | headers).items() if value is not None}
         try:
             connection.putrequest(method, path, skip_host=True)
@@ -125,7 +168,7 @@ class Client:
 
     def events(self, until):
         """Server-sent events (name, content) up to the first for which ``until`` is true."""
-        connection = http.client.HTTPConnection("127.0.0.1", self._server.port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self._server.port, timeout=300)
         connection.request("GET", "/api/events", headers=self.own)
         answer, found = connection.getresponse(), []
         try:
