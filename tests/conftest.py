@@ -8,6 +8,7 @@ import gc
 import os
 import shutil
 import signal
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import cv2
@@ -53,7 +54,7 @@ def pytest_collection_finish():
 def blank_figures():
     """Figures that tests have saved are blank: to draw those of a run takes longer than to track it.
 
-    Slow tests draw, and those that ask for `drawn_figures`. Gives the method that draws.
+    Slow tests draw, and those that ask for `drawn_figures`. Gives contexts for fixtures of wider scope that do.
     """
     save = Figure.savefig
 
@@ -66,24 +67,29 @@ def blank_figures():
         else:
             Path(path).write_bytes(content)
 
+    @contextmanager
+    def drawn():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Figure, "savefig", save)
+            yield
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", save_blank)
-        yield save
+        yield drawn
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def drawn_figures(blank_figures):
-    """Figures are drawn, from the first test or fixture of a file that asks for it to the end of the file."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", blank_figures)
+    """Figures are drawn."""
+    with blank_figures():
         yield
 
 
 @pytest.fixture(autouse=True)
-def figures_of_slow_tests(request, blank_figures, monkeypatch):
+def figures_of_slow_tests(request, blank_figures):
     """Are drawn."""
-    if request.node.get_closest_marker("slow"):
-        monkeypatch.setattr(Figure, "savefig", blank_figures)
+    with blank_figures() if request.node.get_closest_marker("slow") else nullcontext():
+        yield
 
 
 @pytest.fixture

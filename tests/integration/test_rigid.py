@@ -72,13 +72,14 @@ def test_the_pose_alone_is_tracked(folder, use_outline):
 
 
 @pytest.fixture(scope="module")
-def command(folder, drawn_figures):
+def command(folder, blank_figures):
     """Tracks the recording; the run is in the folder."""
     sequence = folder / "seq"
     assert main(["simulate", str(folder / "scene.toml"), "-o", str(sequence)]) == 0
     files = ["--camera", str(sequence / "camera.yaml"), "--landmarks", str(sequence / "landmarks.csv")]
     command = ["track", str(sequence / "frames"), "--model", str(folder / "box.morph"), *files]
-    assert main([*command, "-o", str(folder / "run")]) == 0
+    with blank_figures():
+        assert main([*command, "-o", str(folder / "run")]) == 0
     return command
 
 

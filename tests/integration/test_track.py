@@ -48,9 +48,10 @@ def options(inputs, output, **changes):
 
 
 @pytest.fixture(scope="module")
-def finished(inputs, tmp_path_factory, drawn_figures):
+def finished(inputs, tmp_path_factory, blank_figures):
     folder = tmp_path_factory.mktemp("runs") / "run"
-    return folder, track(options(inputs, folder))
+    with blank_figures():
+        return folder, track(options(inputs, folder))
 
 
 def error_of(run, position):

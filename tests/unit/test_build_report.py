@@ -29,9 +29,10 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def page(model, tmp_path_factory, drawn_figures):
+def page(model, tmp_path_factory, blank_figures):
     path = tmp_path_factory.mktemp("report") / "block.report.html"
-    write_build_report(path, model)
+    with blank_figures():
+        write_build_report(path, model)
     assert list(path.parent.iterdir()) == [path]
     return path.read_text()
 
