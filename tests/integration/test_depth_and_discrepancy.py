@@ -119,37 +119,42 @@ def along_the_sight_line(run):
     return np.mean(errors)
 
 
-def test_depth_puts_the_object_right_along_the_sight_line(recording, tmp_path):
+@pytest.fixture(scope="module")
+def with_depth(recording, tmp_path_factory):
+    """The folder and the run that the depth images count in."""
+    folder = tmp_path_factory.mktemp("with_depth") / "run"
+    return folder, tracked_from(recording, folder, "--depth")
+
+
+def test_depth_puts_the_object_right_along_the_sight_line(recording, with_depth, tmp_path):
     without = along_the_sight_line(tracked_from(recording, tmp_path / "without"))
-    with_depth = along_the_sight_line(tracked_from(recording, tmp_path / "with", "--depth"))
+    folder, run = with_depth
     assert without > 1.0e-3
-    assert with_depth < 0.5 * without
-    summary = json.loads((tmp_path / "with" / "summary.json").read_text())
+    assert along_the_sight_line(run) < 0.5 * without
+    summary = json.loads((folder / "summary.json").read_text())
     assert summary["depth_used"] is True
     assert summary["registration"]["depth_scale"]["std"] < 0.01
 
 
-def test_depths_that_are_all_too_large_do_not_move_the_object_by_as_much(recording, tmp_path):
+def test_depths_that_are_all_too_large_do_not_move_the_object_by_as_much(recording, with_depth, tmp_path):
     """By twice their deviation, 11 mm there: what landmarks find of it counts in all frames."""
     shutil.copytree(recording, tmp_path / "larger")
     for path in (tmp_path / "larger" / "depth").iterdir():
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.rint(1.02 * depth.astype(float)).astype(np.uint16))
     found = tracked_from(tmp_path / "larger", tmp_path / "run", "--depth")
-    as_it_is = tracked_from(recording, tmp_path / "as_it_is", "--depth")
-    assert along_the_sight_line(found) < along_the_sight_line(as_it_is) + 1e-3
+    assert along_the_sight_line(found) < along_the_sight_line(with_depth[1]) + 1e-3
 
 
 @pytest.mark.slow
-def test_depth_images_in_millimetres(recording, tmp_path, refused):
+def test_depth_images_in_millimetres(recording, with_depth, tmp_path, refused):
     """As RealSense and Kinect cameras write them; read as 5000 values a metre they are a fifth of the distances."""
     shutil.copytree(recording, tmp_path / "mm")
     for path in (tmp_path / "mm" / "depth").iterdir():
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.rint(depth / 5.0).astype(np.uint16))
     found = tracked_from(tmp_path / "mm", tmp_path / "run", "--depth", "--depth-per-metre", "1000")
-    as_written = tracked_from(recording, tmp_path / "as_written", "--depth")
-    assert along_the_sight_line(found) == pytest.approx(along_the_sight_line(as_written), abs=2e-4)
+    assert along_the_sight_line(found) == pytest.approx(along_the_sight_line(with_depth[1]), abs=2e-4)
     files = ["--model", recording / "sheet.morph", "--camera", recording / "camera.yaml"]
     start = ["--landmarks", recording / "landmarks.csv", "-o", tmp_path / "none"]
     said = refused("track", tmp_path / "mm", *files, *start, "--depth")
