@@ -96,9 +96,8 @@ class FrameEstimation:
 
     def rough(self, followed: Followed, start: State, prior: Prior | None) -> State:
         """The state by what was followed from the previous frame; only a start for `correct`."""
-        rows = np.flatnonzero(followed.valid)
-        points, every = self._reference.points.take(rows), np.ones(len(rows))
-        return self._scout.minimum(points, followed.pixels[rows], every, start, prior=prior).state
+        weights = followed.valid.astype(float)
+        return self._scout.minimum(self._reference.points, followed.pixels, weights, start, prior=prior).state
 
     def correct(self, picture: Image, state: State, offsets: Array | None, prior: Prior | None) -> PoseHypothesis:
         """Measure against the reference view rendered in ``state`` and estimate from these measurements.

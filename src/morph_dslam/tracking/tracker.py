@@ -290,12 +290,14 @@ class Tracker:
             rows = np.flatnonzero(self._supported)
             count = min(max(FOLLOWED_A_UNKNOWN * len(self.estimator.scale), LEAST_FOLLOWED), MOST_FOLLOWED, len(rows))
             rows = rows[evenly(len(rows), count)]
-            guesses = self._pixels + self._expected_motion(self.reference.projected(self._last), prior)
-            last = self.reference.projected(self._last_by_points)
+            last = self.reference.projected(self._last)
+            guesses = self._pixels + self._expected_motion(last, prior)
             # Half of the size is exact enough for a start.
             found, ok = follow(self._image.half, image.half, 0.5 * self._pixels[rows], 0.5 * guesses[rows], LEVELS - 1)
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
-            found = 2.0 * found if image.motion is None else image.motion.since_last(last[rows], 2.0 * found)
+            found *= 2.0
+            if image.motion is not None:
+                found = image.motion.since_last(self.reference.projected(self._last_by_points)[rows], found)
             pixels[rows], valid[rows] = found, ok
             return Followed(pixels, valid, zero_where_unknown(self._pixels - last))
 
@@ -494,9 +496,7 @@ class Tracker:
             self._last_by_points = state
         self._history.replace_last(state)
         if self._views is not None:
-            self._pixels = np.where(
-                self._supported[:, None], self._pixels, self.reference.projected(self._last_by_points)
-            )
+            self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
 
     def take_over(self, other: Tracker) -> None:
         """Go on after the last frame of another tracker of the object, with what that knows but for the pose."""
@@ -579,7 +579,7 @@ class Tracker:
         angles = self._registration.per_sequence
         self._start = next_start(estimate, self._velocity_base, self.model, self.options, angles)
         self._supported = inliers
-        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last_by_points))
+        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis, image)
         if not self._lost:
