@@ -41,8 +41,8 @@ INWARD_PX = 0.7
 INDEPENDENT = 40.0
 #: By so many standard deviations: one-sided, 5 %.
 ONE_SIDED = 1.645
-#: Standard deviation of a landmark that was clicked, pixels; by so many of these, one counts less.
-CLICK_PX, FAR_OFF = 2.0, 3.0
+#: Standard deviation of a landmark that was clicked, pixels.
+CLICK_PX = 2.0
 #: An edge is where it is expected if it is as near, pixels; chance is asked this far to the sides.
 NEAR_PX, ASIDE_PX = 2.0, (8.0, 12.0, 16.0)
 #: Share of an object's edges that an image shows.
@@ -235,20 +235,9 @@ def add_clicks(
     by_pose = camera.projection_jacobian(points) @ pose_jacobian(points, pose)
     rows = (by_pose @ similarity_jacobian(pose, place, centre)).reshape(-1, 7)
     misses = (click.pixels - camera.project(points)).ravel()
-    weights = 1.0 / (1.0 + (misses / (FAR_OFF * CLICK_PX)) ** 2) ** 2 / CLICK_PX**2
+    weights = 1.0 / (1.0 + (misses / (3.0 * CLICK_PX)) ** 2) ** 2 / CLICK_PX**2
     matrix += rows.T @ (weights[:, None] * rows)
     right += rows.T @ (weights * misses)
-
-
-def click_likelihood(clicks: Sequence[Sighting], place: SimilarityTransform, camera: Camera) -> float:
-    """Log likelihood of landmarks at a place, 0 where all are met; its slope is what `add_clicks` adds."""
-    total = 0.0
-    for click in clicks:
-        misses = click.pixels - camera.project(camera_from_object(click, place).apply(click.points))
-        squares = (misses / CLICK_PX) ** 2
-        # One behind the camera is missed as far as any.
-        total -= 0.5 * float(np.nan_to_num(squares / (1.0 + squares / FAR_OFF**2), nan=FAR_OFF**2).sum())
-    return total
 
 
 @dataclass(frozen=True)
@@ -264,7 +253,6 @@ class EdgeEvidence:
     count : number of points of the outline.
     n_inner : of the inner edges.
     gain_std : standard deviation of ``gain``, by how far the keyframes are apart on it; 0 of a single one.
-    n_views : number of keyframes that show them.
     """
 
     share: float
@@ -274,7 +262,6 @@ class EdgeEvidence:
     count: int
     n_inner: int = 0
     gain_std: float = 0.0
-    n_views: int = 1
 
     @property
     def total(self) -> float:
@@ -282,24 +269,13 @@ class EdgeEvidence:
 
         Of the object's edges an image shows the part `SHOWN`, or what it shows by chance if that is more.
         """
-        share, _, seen, missed = self._ratios
-        return float(share + (1.0 - share) * missed / max(seen, 1e-9)) if seen > 0.0 else 0.0
-
-    @property
-    def log_likelihood(self) -> float:
-        """Of all edges on the object over that by chance, of which `INDEPENDENT` in each keyframe count."""
-        share, count, seen, missed = self._ratios
-        return min(count, INDEPENDENT * self.n_views) * (share * seen + (1.0 - share) * missed)
-
-    @property
-    def _ratios(self) -> tuple[float, int, float, float]:
-        """Share of all edges that are on some, their number, and log likelihood ratios of one that is, and is not."""
-        every = self.count + self.n_inner
-        share = (self.count * self.share + self.n_inner * self.inner) / max(every, 1)
-        chance = (self.count * self.chance + self.n_inner * self.inner_chance) / max(every, 1)
+        every = max(self.count + self.n_inner, 1)
+        share = (self.count * self.share + self.n_inner * self.inner) / every
+        chance = (self.count * self.chance + self.n_inner * self.inner_chance) / every
         chance = float(np.clip(chance, 0.01, 0.95))
-        shown = max(SHOWN, chance)
-        return share, every, float(np.log(shown / chance)), float(np.log((1.0 - shown) / (1.0 - chance)))
+        seen = np.log(max(SHOWN, chance) / chance)
+        missed = np.log((1.0 - max(SHOWN, chance)) / (1.0 - chance))
+        return float(share + (1.0 - share) * missed / max(seen, 1e-9)) if seen > 0.0 else 0.0
 
     @property
     def gain(self) -> float:
@@ -435,7 +411,6 @@ class EdgeImages:
             int(rim.sum()),
             int((~rim).sum()),
             float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else 0.0,
-            len(gains),
         )
 
 

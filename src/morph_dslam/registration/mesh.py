@@ -20,7 +20,6 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import SimilarityTransform
 from morph_dslam.registration.adjusted_keyframes import AdjustedKeyframes, similarity_of_path
-from morph_dslam.registration.edge_registration import EdgeRegistration
 from morph_dslam.registration.edges import EdgeEvidence
 from morph_dslam.registration.hints import NO_HINTS, Hints
 from morph_dslam.registration.icp import Surface, same_place
@@ -40,7 +39,7 @@ from morph_dslam.registration.point_search import MOST_ASKED, Place, places_by_p
 from morph_dslam.registration.registration import Axis, Rival
 from morph_dslam.registration.scene import METRIC_SCALE_STD, MapPoints, View, spread_views, views_of
 from morph_dslam.registration.texture import FEWEST, Agreement, TextureComparison
-from morph_dslam.registration.view_registration import TELLING_CHANCE, Claimed, EdgeSearch
+from morph_dslam.registration.view_registration import TELLING_CHANCE, Claimed, EdgeRegistration, EdgeSearch
 from morph_dslam.sources.recorded import DEPTH_SCALE
 
 Array = NDArray[np.float64]

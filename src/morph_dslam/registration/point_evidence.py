@@ -54,12 +54,6 @@ class PointEvidence:
         """Points explained, but for one plane, less those occluded, these `VIOLATION` times."""
         return float(self.solid.sum() - VIOLATION * self.occluded.sum())
 
-    def balance(self, independent: float) -> float:
-        """Points that agree, less those occluded, these `VIOLATION` times, and of all of them at most so many count."""
-        every = float(self.explained.sum() + self.occluded.sum() + self.hidden_by.sum())
-        agreeing = float(self.closeness[self.explained].sum()) - VIOLATION * float(self.occluded.sum())
-        return agreeing * min(1.0, independent / max(every, 1.0))
-
     @property
     def agreement(self) -> float:
         """How far the points where it is seen agree, -1 to 1; near 0 where there are few or they lie in one plane."""

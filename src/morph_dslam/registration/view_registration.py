@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
 
@@ -21,8 +21,7 @@ from morph_dslam.camera import Camera
 from morph_dslam.errors import RegistrationError, RegistrationFailure
 from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.registration.dense_points import DEPTH_NOISE, PointsOnSurface, with_dense_points
-from morph_dslam.registration.edge_registration import AGREES, EdgeRegistration, as_well_seen, rank_of
-from morph_dslam.registration.edges import CLICK_PX, EdgeImages, Sighting, click_likelihood
+from morph_dslam.registration.edges import CLICK_PX, EdgeEvidence, EdgeImages, Sighting
 from morph_dslam.registration.hints import NO_HINTS, GuessedPose, Hints
 from morph_dslam.registration.icp import Surface, same_place
 from morph_dslam.registration.mesh_edges import MeshEdges
@@ -48,6 +47,8 @@ Array = NDArray[np.float64]
 FEWEST_AGREEING, AGREEING_SHARE = 6, 0.6
 #: A metric map's unit may be off by this part where points on the object show it: its depths have errors.
 UNIT_ERROR = 0.12
+#: Log likelihood for a point that agrees, and against one that does not.
+AGREES = 0.5
 #: What several keyframes say counts by this, as steps of the search carry an object some way off in them.
 BY_SEVERAL = 0.5
 #: Edges of smaller objects, pixels, count less in proportion: their points are too near each other to be independent.
@@ -73,6 +74,8 @@ CELL, SIZES_ALIKE, MOST_ALIKE = 64, 0.36, 3
 QUICK, ROUGH, FINE, NEAREST = (8, 5, 3), (12, 8, 6, 4, 3), (8, 6, 5, 4, 3), (4, 3, 3, 3, 3, 3)
 #: Keyframes that get points by stereo.
 N_STEREO = 8
+#: Where there are too few points to agree, edges decide among such places.
+NO_POINTS = 0.05
 #: A point lies on the object if it is so near to the surface, over the object's size.
 TOLERANCE = 0.015
 #: Units of the map that are tried where landmarks have the object: so many, from the one in which it is as far away as
@@ -91,8 +94,45 @@ N_NEAR, NEAR_GUESS_PX, NEAR_GUESS_SIZE, NEAR_GUESS_TURN = 120, 12.0, 0.08, 0.12
 #: Pixels searched in turn for the edges about these.
 ABOUT_GUESS = (16, 8, 5, 3)
 
+
 #: Takes points on other objects out of a map, and out of what its views have seen.
 Claimed = Callable[[MapPoints, Sequence[View]], tuple[MapPoints, list[View]]]
+
+
+@dataclass(frozen=True)
+class EdgeRegistration:
+    """An object laid by its edges.
+
+    Attributes
+    ----------
+    place : metres to the map's unit.
+    covariance : (7, 7) of log scale, rotation vector and translation about the mean node.
+    edges : how much of its edges the keyframes show there.
+    points : what the points of the map say.
+    """
+
+    place: SimilarityTransform
+    covariance: Array
+    edges: EdgeEvidence
+    points: PointEvidence
+
+    @property
+    def rank(self) -> float:
+        """What speaks for it."""
+        return _rank(self.edges, self.points)
+
+
+def _as_well_seen(other: EdgeRegistration, found: EdgeRegistration) -> bool:
+    """Whether keyframes show as much of the outline at another place, as far as they agree on it.
+
+    Edges place an object more exactly than points do, so that these choose among places where as many edges are seen.
+    """
+    return other.edges.gain >= found.edges.gain - found.edges.gain_std
+
+
+def _rank(edges: EdgeEvidence, points: PointEvidence) -> float:
+    """What speaks for a place, at most 1: its edges beyond chance and the points that agree must both do so."""
+    return edges.total * max(points.agreement, NO_POINTS)
 
 
 class EdgeSearch:
@@ -173,14 +213,15 @@ class EdgeSearch:
         """Distinct places near some others, the best first."""
         few = EdgeImages(spread_views(self._views, FEW_VIEWS), self.camera, self.scale_std)
 
-        def rough(start: SimilarityTransform) -> EdgeRegistration:
-            place, covariance = few.refine(self.edges, start, ROUGH, self._hints.clicks, self._on_it)
-            return self._with_evidence(place, covariance, few, FEW_VIEWS)
+        def rough(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
+            place = few.refine(self.edges, start, ROUGH, self._hints.clicks, self._on_it)[0]
+            return _rank(few.evidence(self.edges, place), self.points_at(place, FEW_VIEWS)), place
 
-        chosen = self._distinct(on_all_cores(rough, starts), N_FINE)
-        return self._distinct(
-            on_all_cores(lambda each: self._fitted(each.place, self._images(each.place), FINE), chosen)
-        )
+        chosen: list[SimilarityTransform] = []
+        for _, place in sorted(on_all_cores(rough, starts), key=lambda pair: -pair[0]):
+            if len(chosen) < N_FINE and not any(self.same(place, other) for other in chosen):
+                chosen.append(place)
+        return self._distinct(on_all_cores(lambda place: self._fitted(place, self._images(place), FINE), chosen))
 
     def _polished(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
         """Distinct places, the best first, those that may be right fitted from other starts, too."""
@@ -189,16 +230,13 @@ class EdgeSearch:
         best = max((each.rank for each in again), default=0.0)
         return self._distinct([self._sized(each) if each.rank >= MUCH_WORSE * best else each for each in again])
 
-    def _distinct(self, found: Sequence[EdgeRegistration], most: int | None = None) -> list[EdgeRegistration]:
-        """At most so many distinct places, the best first, each as it is likeliest."""
+    def _distinct(self, found: Sequence[EdgeRegistration]) -> list[EdgeRegistration]:
+        """Those that are not the same place as a better one, the best first."""
         kept: list[EdgeRegistration] = []
         for each in sorted(found, key=lambda each: -each.rank):
-            alike = next((k for k, other in enumerate(kept) if self.same(each.place, other.place)), None)
-            if alike is not None:
-                kept[alike] = max(kept[alike], each, key=lambda one: one.likelihood)
-            elif most is None or len(kept) < most:
+            if not any(self.same(each.place, other.place) for other in kept):
                 kept.append(each)
-        return sorted(kept, key=lambda each: -each.rank)
+        return kept
 
     def same(self, a: SimilarityTransform, b: SimilarityTransform) -> bool:
         """Whether two places are one as a camera sees them; the map's unit may differ."""
@@ -220,8 +258,11 @@ class EdgeSearch:
         by_both = images.refine(edges, start, reaches, clicks, self._on_it)
         by_edges = images.refine(edges, start, [*reaches, *NEAREST], clicks)
         in_size = images.refine(edges, by_both[0], NEAREST, clicks, keep_scale=True)[0]
-        fits = [self._with_evidence(*fit, images) for fit in (by_edges, (in_size, by_both[1]))]
-        return max(fits, key=lambda each: each.likelihood)
+        fits = [
+            EdgeRegistration(place, covariance, images.evidence(edges, place), self.points_at(place))
+            for place, covariance in (by_edges, (in_size, by_both[1]))
+        ]
+        return max(fits, key=lambda each: each.rank)
 
     def _again(self, found: EdgeRegistration) -> EdgeRegistration:
         """The best place near one that was found, of those begun where each keyframe alone has the object."""
@@ -236,7 +277,8 @@ class EdgeSearch:
             return self._fitted(start, images, NEAREST)
 
         seeing = views_of(self.edges.nodes, found.place, self._dense[1], self.camera, MORE_VIEWS)
-        return max([found, *on_all_cores(from_view, seeing)], key=lambda each: each.likelihood)
+        fits = [each for each in on_all_cores(from_view, seeing) if _as_well_seen(each, found)]
+        return max([found, *fits], key=lambda each: each.rank)
 
     def _sized(self, found: EdgeRegistration) -> EdgeRegistration:
         """A place with the size by its edges and the points in its outline together, unless they contradict each other.
@@ -251,7 +293,7 @@ class EdgeSearch:
         sized = replace(self.at(place), covariance=covariance)
         apart = abs(np.log(place.scale / found.place.scale))
         agree = apart <= SIZES_AGREE * np.sqrt(found.covariance[0, 0]) and sized.rank > ABOUT_AS_MUCH * found.rank
-        return sized if agree and as_well_seen(sized, found) else found
+        return sized if agree and _as_well_seen(sized, found) else found
 
     def _images(self, place: SimilarityTransform) -> EdgeImages:
         """Edges of the keyframes that see the object at a place."""
@@ -260,15 +302,8 @@ class EdgeSearch:
 
     def at(self, place: SimilarityTransform) -> EdgeRegistration:
         """What speaks for a place as it is."""
-        return self._with_evidence(place, np.zeros((7, 7)), self._images(place))
-
-    def _with_evidence(
-        self, place: SimilarityTransform, covariance: Array, images: EdgeImages, most: int = MORE_VIEWS
-    ) -> EdgeRegistration:
-        """A place with what some images and the points seen in so many keyframes say of it."""
-        clicked = click_likelihood(self._hints.clicks, place, self.camera)
-        edges, points = images.evidence(self.edges, place), self.points_at(place, most)
-        return EdgeRegistration(place, covariance, edges, points, clicked)
+        edges = self._images(place).evidence(self.edges, place)
+        return EdgeRegistration(place, np.zeros((7, 7)), edges, self.points_at(place))
 
     def points_at(self, place: SimilarityTransform, most: int = MORE_VIEWS) -> PointEvidence:
         """What the points seen in so many keyframes say of a place."""
@@ -350,7 +385,7 @@ class EdgeSearch:
 
         def ranked(start: SimilarityTransform) -> tuple[float, SimilarityTransform]:
             place = one.refine(self.edges, start, reaches, (), self._on_it, keep_scale=True)[0]
-            return rank_of(one.evidence(self.edges, place), self._points_in(place, [view])), place
+            return _rank(one.evidence(self.edges, place), self._points_in(place, [view])), place
 
         return [place for _, place in sorted(on_all_cores(ranked, starts), key=lambda pair: -pair[0])[:N_FITTED]]
 
