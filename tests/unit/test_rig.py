@@ -358,8 +358,11 @@ def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_es
         told = z + np.linalg.solve(root.T, rng.standard_normal(z.shape).T).T
         covariance = np.linalg.inv(np.eye(3) + information)
         off += (z - told @ information @ covariance) @ moves[camera].T
-        nothing = np.zeros(0)
-        corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
+        # A camera that finds its depths' scale beside the factors has one more, which goes with them.
+        mixed = 0.3 * covariance[:, :1]
+        with_scale = np.block([[covariance, mixed], [mixed.T, covariance[:1, :1]]])
+        nothing, left = np.zeros(0), sqrtm(with_scale if camera else covariance).real
+        corrections.append(ReferenceCorrection(nothing, nothing, nothing, left, nothing))
     errors, plain = RigErrors(trackers, RIG, [CommonDepthScale()] * 2), replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
     scales = np.outer(estimator.scale, estimator.scale)

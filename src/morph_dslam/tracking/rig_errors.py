@@ -205,7 +205,8 @@ def _pushed_by_reference(views: Sequence[tuple[CameraView, Linearization]]) -> A
     for view, frame in views:
         push = view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths)
         if view.corrected is not None:
-            of_reference, of_noise = view.corrected.left_by_cause
+            # Beyond the factors of the reference its camera may know one of its depths' scale.
+            of_reference, of_noise = view.corrected.left_by_cause(push.shape[1])
             by_noise.append(push @ of_noise)
             push = push @ of_reference
         in_common.append(push)
