@@ -173,7 +173,8 @@ class Estimate:
     covariance : (d + 6, d + 6) of [parameters, rotation vector, translation]; infinite when undetermined.
     at_bound : (d,) parameters that ended at a bound of the box, but for those that are known beforehand.
     iterations, converged : how the iteration ended.
-    measured_covariance : the covariance without any prior on the parameters; None where there was none.
+    measured_covariance : the covariance without any prior on the parameters, and without what their ranges say of their
+        errors; None where neither is in the other one.
     stated_covariance : the covariance before the residuals widen it, by what they show that model and reference are off
         by; None where they do not.
     by_model : what the model's own errors have added to the covariance; None where they have not.

@@ -34,6 +34,7 @@ from morph_dslam.tracking.outcomes import (
     TiltAmbiguous,
     TrackingWarning,
 )
+from morph_dslam.tracking.range_limits import cut_down, mean_squares_in_ranges
 from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.sequence_filter import SequenceFilter
@@ -227,6 +228,31 @@ def with_flat_sides(result: FrameResult, sides: FlatSides) -> FrameResult:
     if estimate is None or (flat := sides.variances(estimate.state.parameters, estimate.parameter_std)) is None:
         return result
     return replace(result, estimate=replace(estimate, flat=flat))
+
+
+def within_ranges(result: FrameResult) -> FrameResult:
+    """The result with no larger deviation of a parameter than its range allows, see `range_limits`.
+
+    What is observable goes by the deviations without it: they stay in ``measured_covariance``.
+
+    Parameters
+    ----------
+    result : of a frame, with all errors in its deviations.
+    """
+    estimate = result.estimate
+    if estimate is None:
+        return result
+    limits = mean_squares_in_ranges(result.model, estimate.state.parameters)
+    covariance, of_shape = cut_down(estimate.covariance, limits), estimate.of_shape
+    of_shape = None if of_shape is None else cut_down(of_shape, limits)
+    measured, flat = estimate.measured_covariance, estimate.flat
+    is_cut = covariance is not estimate.covariance or of_shape is not estimate.of_shape
+    if is_cut and measured is None:
+        measured = estimate.image_covariance
+    if flat is not None:
+        flat = np.minimum(flat, np.maximum(limits - np.diag(covariance)[: len(flat)], 0.0))
+    found = replace(estimate, covariance=covariance, measured_covariance=measured, of_shape=of_shape, flat=flat)
+    return replace(result, estimate=found)
 
 
 def pose_source(hypothesis: PoseHypothesis, still: bool) -> PoseSource:

@@ -20,7 +20,7 @@ from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX,
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior, State
 from morph_dslam.tracking.flat_sides import FlatSides
-from morph_dslam.tracking.frame_results import warnings_of_place, with_flat_sides, with_model_errors
+from morph_dslam.tracking.frame_results import warnings_of_place, with_flat_sides, with_model_errors, within_ranges
 from morph_dslam.tracking.frame_starts import FrameGaps, new_filter, next_start
 from morph_dslam.tracking.hypothesis import Image
 from morph_dslam.tracking.noise import RigObservations
@@ -313,7 +313,8 @@ class RigTracker:
         errors, known = self._model_errors, self.estimator.known.indices
         if errors is not None:
             errors = errors.where_known(known, found.pose_from.is_of_frame_alone)
-        return with_flat_sides(with_model_errors(found, errors, self._filter.held), self._flat_sides)
+        found = with_model_errors(found, errors, self._filter.held)
+        return within_ranges(with_flat_sides(found, self._flat_sides))
 
     def _prior(self, known: PosePrior, results: list[FrameResult]) -> Prior | None:
         """What the map tells of the pose; None if the points of a camera show the object elsewhere."""

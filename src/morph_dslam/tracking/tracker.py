@@ -35,6 +35,7 @@ from morph_dslam.tracking.frame_results import (
     warnings_of_place,
     with_flat_sides,
     with_model_errors,
+    within_ranges,
 )
 from morph_dslam.tracking.frame_starts import FrameGaps, new_filter, next_start
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis, reject
@@ -215,7 +216,7 @@ class Tracker:
                 self.estimator.loads.learn(found.state.parameters, found.covariance, found.sigma_px)
             change = self._choose_view(image, hypothesis, result)
             result = with_model_errors(result, self._errors_now(result.pose_from), self._filter.held)
-            result = with_flat_sides(result, self._flat_sides)
+            result = within_ranges(with_flat_sides(result, self._flat_sides))
         times = clock.milliseconds | {"locate": camera.milliseconds}
         made_view = change is not None and change.is_new
         return replace(result, made_view=made_view, timings_ms=times, total_ms=clock.total + camera.milliseconds)
