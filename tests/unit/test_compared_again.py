@@ -69,7 +69,7 @@ def test_a_sensor_is_weighed_by_the_comparison_that_is_kept():
     estimator.known.tell({"arch": (0.048, 2e-3)})
     estimation, attempt = compared(rest, estimator)
     assert int(attempt.inliers.sum()) == pytest.approx(0.6 * COUNT, abs=2)
-    again = estimation.fitted(attempt)
+    again = estimator.fit(estimation.beside.measured(attempt), attempt.estimate.state, attempt.prior)
     assert abs(again.state.parameters[0] - 0.05) < 3.0 * np.sqrt(again.covariance[0, 0])
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from morph_dslam.tracking.beside_texture import weighed_by_residuals
 from morph_dslam.tracking.depth import PointDepths
-from morph_dslam.tracking.depth_weight import weighed_by_residuals
 from morph_dslam.tracking.refinement import EFFECTIVE_POINTS
 
 COUNT, PER_METRE, SIGMA_PX = 300, 500.0, 0.4

@@ -44,10 +44,11 @@ class View:
         self._exact, self._rng = CAMERA.project(self._points.in_camera(LATER)), np.random.default_rng(0)
         part = BoundPart(slice(None), REFERENCE, error_factors_of(np.diag(STD**2), self.estimator.scale))
         unused: Any = anything
+        beside = SimpleNamespace(estimator=self.estimator, hessian_of_outline=lambda *_: None)
         self.active: Any = SimpleNamespace(
             systematic=SystematicErrors(self.estimator, self._points, [part], 17),
             recovery=Recovery(MODEL, CAMERA, unused, unused, TrackerOptions()),
-            estimation=SimpleNamespace(known=self.estimator.known, hessian_of_outline=lambda attempt: None),
+            estimation=SimpleNamespace(beside=beside),
             reference=SimpleNamespace(few_corners=None),
         )
 

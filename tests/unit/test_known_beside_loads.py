@@ -80,7 +80,7 @@ def refuted_frames(model, offset, push, seed, frames=8):
         estimate = estimator.estimate(points, pixels, ones, state, prior=held)
         measurement = Measurement(pixels, pixels, ones > 0.0, ones > 0.0, ones)
         hypothesis = PoseHypothesis(estimate, ones > 0.0, measurement, ones, held)
-        found += len(refuted_values(hypothesis, estimation, systematic, None, 0.0, False))
+        found += len(refuted_values(hypothesis, estimation.beside, systematic, None, 0.0, False))
         assert estimator.loads is not None
         estimator.loads.learn(estimate.state.parameters, estimate.covariance, estimate.sigma_px)
         state = estimate.state

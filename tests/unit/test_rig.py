@@ -373,7 +373,7 @@ def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_es
 
 def test_nothing_is_added_where_nothing_is_known(model):
     found, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, None)])
-    errors = RigErrors(trackers, RIG)
+    errors = RigErrors(trackers, RIG, [CommonDepthScale()] * 2)
     views = errors.views(found, seen)
     left = [view.unexplained.px for view in views]
     assert max(left) < 1e-6

@@ -143,9 +143,9 @@ def _with_systematic_errors(
     hypothesis: PoseHypothesis, view: ActiveView, past: SequenceFilter, errors: ModelErrors | None
 ) -> tuple[Estimate, float, list[TrackingWarning]]:
     """The estimate with errors that do not average out in its covariance, and what that says of it."""
-    systematic, recovery = view.systematic, view.recovery
+    systematic, recovery, beside = view.systematic, view.recovery, view.estimation.beside
     if systematic is None:  # what is measured refers to no other image
-        left = view.estimation.left_by_outline(hypothesis)
+        left = view.estimation.alone.left(hypothesis)
         return hypothesis.estimate, left.px, [ModelDoesNotExplain(left.px)] if left.is_failure else []
     left = systematic.unexplained(hypothesis.estimate, hypothesis.inliers)
     doubt_px, blurred = recovery.doubt(hypothesis), hypothesis.blurred
@@ -154,11 +154,11 @@ def _with_systematic_errors(
     # What is found on a blurred path errs with the texture: all that is left may be alike for neighbours.
     common_px = max(left.px, doubt_px if blurred is None else left.total_px)
     known = (past.past_information, past.keeps)
-    refuted = refuted_values(hypothesis, view.estimation, systematic, errors, doubt_px, is_its_own)
+    refuted = refuted_values(hypothesis, beside, systematic, errors, doubt_px, is_its_own)
     # Learned from the images alone.
-    learns = is_its_own and blurred is None and not len(view.estimation.known.indices)
+    learns = is_its_own and blurred is None and not len(beside.estimator.known.indices)
     found, prior = hypothesis.estimate, hypothesis.prior
-    others = hypothesis.corrected_depths, view.estimation.hessian_of_outline(hypothesis), hypothesis.correction
+    others = hypothesis.corrected_depths, beside.hessian_of_outline(hypothesis, found.state), hypothesis.correction
     estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, *others)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if blurred is not None:

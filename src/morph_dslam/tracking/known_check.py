@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morph_dslam.model.model_errors import ModelErrors
+from morph_dslam.tracking.beside_texture import BesideTexture
 from morph_dslam.tracking.estimator import Estimate
-from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import PoseHypothesis
 from morph_dslam.tracking.outcomes import KnownRefuted
 from morph_dslam.tracking.reference_misfit import REFUTED
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 def refuted_values(
     hypothesis: PoseHypothesis,
-    estimation: FrameEstimation,
+    beside: BesideTexture,
     systematic: SystematicErrors,
     errors: ModelErrors | None,
     doubt_px: float,
@@ -37,31 +37,31 @@ def refuted_values(
     Parameters
     ----------
     hypothesis : that is accepted, by images and known values.
-    estimation : that it was made by.
+    beside : that it was made by.
     systematic : errors of the reference and of the model's shape.
     errors : of the model's mesh and reduction; None where none are known.
     doubt_px : what the points that agree may have in common, pixels.
     learns : whether the residuals are the object's, so that they show how well the reference is known. Those that known
         values leave are not: a wrong sensor would pass for a wrong registration.
     """
-    known = estimation.known
+    known = beside.estimator.known
     if not len(known.indices):
         return []
     rows, (values, deviations) = known.indices, known.now.T
     hypothesis = replace(hypothesis, correction=None)  # which was found with the sensors' help
     with known.set_aside():
-        alone = estimation.fitted(hypothesis)
+        alone = beside.estimator.fit(beside.measured(hypothesis), hypothesis.estimate.state, hypothesis.prior)
         common_px = max(systematic.unexplained(alone, hypothesis.inliers).px, doubt_px)
 
         def stated(estimate: Estimate, learns: bool) -> Array:
             """Variances of the known parameters with all errors."""
-            others = hypothesis.point_depths, estimation.hessian_of_outline(replace(hypothesis, estimate=estimate))
+            others = hypothesis.point_depths, beside.hessian_of_outline(hypothesis, estimate.state)
             asked = hypothesis.weights, common_px, hypothesis.prior, learns, None, False, hypothesis.blurred
             return np.diag(systematic.added(estimate, *asked, *others).covariance)[rows]
 
         variances = stated(alone, learns and hypothesis.blurred is None)
         if known.model.n_loads:
-            variances = np.maximum(variances, _beside_any_loads(hypothesis, estimation, alone, stated))
+            variances = np.maximum(variances, _beside_any_loads(hypothesis, beside, alone, stated))
     found, variances = alone.state.parameters[rows], deviations**2 + variances
     if errors is not None:
         variances = variances + np.diag(errors.at(alone.state.parameters).parameters)[rows]
@@ -75,7 +75,7 @@ def refuted_values(
 
 
 def _beside_any_loads(
-    hypothesis: PoseHypothesis, estimation: FrameEstimation, alone: Estimate, stated: Callable[[Estimate, bool], Array]
+    hypothesis: PoseHypothesis, beside: BesideTexture, alone: Estimate, stated: Callable[[Estimate, bool], Array]
 ) -> Array:
     """Variances of the known parameters where any unknown loads are as likely as others.
 
@@ -85,10 +85,13 @@ def _beside_any_loads(
 
     Parameters
     ----------
-    hypothesis, estimation : as of `refuted_values`.
+    hypothesis, beside : as of `refuted_values`.
     alone : the images' own estimate.
     stated : variances (k,) of an estimate with all errors, and whether to learn from its residuals.
     """
-    with estimation.any_loads():
+    estimator, measured = beside.estimator, beside.measured(hypothesis)
+    assert estimator.loads is not None
+    with estimator.loads.set_aside():
         places = (alone, replace(alone, state=hypothesis.estimate.state))
-        return np.max([stated(estimation.restated(hypothesis, place), False) for place in places], axis=0)
+        again = [estimator.restated(measured, place, hypothesis.prior) for place in places]
+        return np.max([stated(estimate, False) for estimate in again], axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,13 +54,10 @@ from morph_dslam.tracking.tracker_inputs import check_pose, check_tracker
 from morph_dslam.tracking.views import KeyframeViews
 
 Array = NDArray[np.float64]
-
-
+_Kind = TypeVar("_Kind", bound=TrackingWarning)
 #: Why several cameras refuse an object whose outline is all there is.
 NO_TEXTURE = "the object shows too few corners, and its outline alone is followed with one camera: leave out --with"
 OUTLINE_ALONE = "the outline alone (--no-texture) is followed with one camera: leave it or --with out"
-
-
 #: A camera of which a smaller share of the points agrees with all cameras together contradicts them.
 LEAST_AGREEING = 0.5
 
@@ -121,39 +119,31 @@ class RigTracker:
         error_factors = error_factors_of(registration.covariance, self.estimator.scale)
         # What earlier frames add is found from all cameras together.
         single = replace(self.options, per_sequence=(), random_walk=(), new_views=False)
+        # It is the first camera whose depths a registration knows.
+        scales = [registration.depth_scale, *[None] * (len(self.cameras) - 1)]
         self.trackers: list[Tracker] = []
         for number, (part, image) in enumerate(zip(self.cameras, references, strict=True)):
             grey = image.grey if isinstance(image, Image) else image
             part.camera.checked_picture(grey, f"the reference frame of camera {number}")
             in_camera = None if error_factors is None else part.chain(len(self.model.parameters)) @ error_factors
+            known = Registration(self.model, part.seen(registration.state), depth_scale=scales[number])
+            covered = None if seen is None else seen[number]
+            others = KeyframeViews(in_camera) if keyframes is None else keyframes[number]
             try:
                 tracker = Tracker(
-                    self.model,
-                    part.camera,
-                    # It is the first camera whose depths it knows.
-                    Registration(
-                        self.model,
-                        part.seen(registration.state),
-                        depth_scale=None if number else registration.depth_scale,
-                    ),
-                    single,
-                    reference=image,
-                    in_sequence=in_sequence,
-                    seen=None if seen is None else seen[number],
-                    keyframes=KeyframeViews(in_camera) if keyframes is None else keyframes[number],
-                )
+                    self.model, part.camera, known, single,
+                    reference=image, in_sequence=in_sequence, seen=covered, keyframes=others,
+                )  # fmt: skip
             except RegistrationError as error:
-                raise RegistrationError(
-                    f"camera {number}: {part.not_seen(registration.state, model) or error}"
-                ) from error
+                why = part.not_seen(registration.state, model) or error
+                raise RegistrationError(f"camera {number}: {why}") from error
             if tracker.reference.outline_alone:
                 raise RegistrationError(f"camera {number}: {NO_TEXTURE}" if self.options.use_texture else OUTLINE_ALONE)
             self.trackers.append(tracker)
         self.trackers[0].anchor = anchor
         self._filter, self._gaps = new_filter(self.estimator, self.options), FrameGaps()
-        found, std = registration.depth_scale, self.options.depth_scale_std
-        scales = [CommonDepthScale.of(None if number else found, std) for number in range(len(self.cameras))]
-        self._errors = RigErrors(self.trackers, self.cameras, scales)
+        common = [CommonDepthScale.of(scale, self.options.depth_scale_std) for scale in scales]
+        self._errors = RigErrors(self.trackers, self.cameras, common)
         self._model_errors = ModelErrors.of(self.model, self.options.per_sequence)
         self._flat_sides = FlatSides(self.model, self._model_errors)
         self._sigma_px = FIRST_SIGMA_PX
@@ -201,7 +191,7 @@ class RigTracker:
         self.estimator.known.begin(number, time)
         self._filter.go_on(self._gaps.n_missing(number))
         known, results = where.pose_prior, self._each(frames, time, where.pose_prior, occluder_depths)
-        has_moved = any(result.warning(ObjectMoved) is not None for result in results)
+        has_moved = bool(_all_of(results, ObjectMoved))
         prior = None if known is None or has_moved else self._prior(known, results)
         with frame_clock(STAGES) as clock, stage("fuse"):
             estimate, measured, rejection = self._together(results, prior)
@@ -212,7 +202,7 @@ class RigTracker:
         times = {name: sum((result.timings_ms[name] for result in results), 0.0) for name in STAGES}
         times["fuse"] += clock.milliseconds["fuse"]
         times["locate"] = where.milliseconds
-        told = (*self.estimator.known.warnings, *_ignored(results, measured), *_readout_unused(results))
+        told = (*self.estimator.known.warnings, *_ignored(results, measured), *_all_of(results, ReadoutNotUsed)[:1])
         is_hidden = estimate is None and known is not None and not has_moved
         result = FrameResult(
             self.model,
@@ -298,7 +288,7 @@ class RigTracker:
                 *lost.warnings,
                 *([PastForgotten()] if self._filter.forgot else []),
                 *refuted,
-                *_blurred(results),
+                *sorted(_all_of(results, BlurredByMotion), key=lambda warning: -warning.path_px)[:1],
                 *_few_agree(results, measured),
                 *_depth_unused(results),
                 *([] if refuted else _not_explained(results, left)),
@@ -358,10 +348,9 @@ def agreeing(measured: RigObservations, residuals: Array, limit_px: float) -> Ri
     """
     with np.errstate(invalid="ignore"):
         close = np.linalg.norm(residuals, axis=1) < limit_px
-    kept, first = [], 0
-    for view in measured.views:
-        weights = np.where(close[first : first + len(view.weights)], view.weights, 0.0)
-        first += len(view.weights)
+    kept = []
+    for view, near in zip(measured.views, measured.split(close), strict=True):
+        weights = np.where(near, view.weights, 0.0)
         if (weights > 0.0).sum() < LEAST_AGREEING * (view.weights > 0.0).sum():
             weights = np.zeros_like(weights)
         # The depth beside such a point is that of whatever is there.
@@ -403,23 +392,15 @@ def _refuted(results: list[FrameResult]) -> list[KnownRefuted]:
     return list(found.values())
 
 
-def _blurred(results: list[FrameResult]) -> list[BlurredByMotion]:
-    """The warning of motion blur of the camera that sees most of it, if one does."""
-    found = [warning for result in results if (warning := result.warning(BlurredByMotion)) is not None]
-    return sorted(found, key=lambda warning: -warning.path_px)[:1]
-
-
-def _readout_unused(results: list[FrameResult]) -> list[ReadoutNotUsed]:
-    """The warning that a readout time does not count, of the first camera that has it."""
-    found = [warning for result in results if (warning := result.warning(ReadoutNotUsed)) is not None]
-    return found[:1]
+def _all_of(results: list[FrameResult], kind: type[_Kind]) -> list[_Kind]:
+    """The warnings of a kind, one of each camera that has it."""
+    return [warning for result in results if (warning := result.warning(kind)) is not None]
 
 
 def _few_agree(results: list[FrameResult], measured: RigObservations) -> list[FewPointsAgree]:
     """The warning that few points agree of the camera whose points agree least, of those that count."""
     counted = [result for result, view in zip(results, measured.views, strict=True) if view.weights.any()]
-    found = [warning for result in counted if (warning := result.warning(FewPointsAgree)) is not None]
-    return sorted(found, key=lambda warning: -warning.spread_px)[:1]
+    return sorted(_all_of(counted, FewPointsAgree), key=lambda warning: -warning.spread_px)[:1]
 
 
 def _depth_unused(results: list[FrameResult]) -> list[DepthNotUsed]:

@@ -69,6 +69,10 @@ class RigObservations:
         """(p,) as in `Observations`."""
         return np.concatenate([view.numbers for view in self.views])
 
+    def split(self, values: Array) -> list[Array]:
+        """By camera what (p, ...) is of all points."""
+        return np.split(values, np.cumsum([len(view.weights) for view in self.views])[:-1])
+
     @cached_property
     def correlation(self) -> Correlation:
         """(p, p); the errors of different cameras have nothing in common."""

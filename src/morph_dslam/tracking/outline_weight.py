@@ -43,8 +43,6 @@ LEAST_POINTS = 12
 #: Of so many of the texture's points, the nearest to one of the outline, so many must be found, or something covers
 #: both. Chosen on rendered sheets; one and three do nearly as well.
 NEIGHBOURS, LEAST_NEIGHBOURS = 5, 2
-
-
 #: Pairs are made of no more points than these.
 MOST_COMPARED = 100
 #: What an estimate leaves of the numbers is at least this share of them.
@@ -64,15 +62,6 @@ class ErrorComponent:
         self.variance, self.redundancy = np.nan, 1.0
         self._alike, self._apart = float(np.exp(-NEAR_PX / FIRST_LENGTH_PX)), NEAR_PX
 
-    def suppose(self, pixels: Array, variance: float) -> None:
-        """Begin with a variance of a number, and errors that are alike as they are before any frame has shown it.
-
-        ``pixels`` (p, 2) are those of the points.
-        """
-        compared = evenly(len(pixels), MOST_COMPARED)
-        alike = float(mean_correlation(pixels[compared], FIRST_LENGTH_PX))
-        self.variance, self.redundancy = variance, 1.0 + (len(pixels) - 1) * alike
-
     def learn(self, pixels: Array, residuals: Array, variance: float) -> None:
         """Take in a frame.
 
@@ -86,7 +75,7 @@ class ErrorComponent:
             return
         compared = evenly(len(pixels), MOST_COMPARED)
         some = pixels[compared]
-        alike, apart = near_products(some, residuals[compared], NEAR_PX)
+        alike, apart = near_products(some, residuals[compared])
         alike /= max(float(np.mean(residuals**2)), 1e-300)
         rate = 1.0 if np.isnan(self.variance) else LEARNING_RATE
         self.variance = variance if rate == 1.0 else self.variance + rate * (variance - self.variance)
@@ -145,10 +134,12 @@ class OutlineBalance:
 
         In the state that a wrong registration gives, residuals tell of that alone.
         """
-        if seen.valid.sum() < LEAST_POINTS:
+        pixels = seen.pixels[seen.valid]
+        if len(pixels) < LEAST_POINTS:
             return False
+        alike = float(mean_correlation(pixels[evenly(len(pixels), MOST_COMPARED)], FIRST_LENGTH_PX))
         self.outline = ErrorComponent()
-        self.outline.suppose(seen.pixels[seen.valid], LEAST_SPREAD_PX**2)
+        self.outline.variance, self.outline.redundancy = LEAST_SPREAD_PX**2, 1.0 + (len(pixels) - 1) * alike
         return True
 
     def agreeing(self, residuals: Array) -> NDArray[np.bool_]:
@@ -174,7 +165,7 @@ class OutlineBalance:
     def in_common(self, seen: OutlineMeasurement, residuals: Array) -> float:
         """Root mean product of what neighbours on the outline are off by together, pixels."""
         across = np.einsum("pk,pk->p", residuals, seen.normals)[seen.valid]
-        return float(np.sqrt(max(near_products(seen.pixels[seen.valid], across[:, None], NEAR_PX)[0], 0.0)))
+        return float(np.sqrt(max(near_products(seen.pixels[seen.valid], across[:, None])[0], 0.0)))
 
     def learn_outline(self, seen: OutlineMeasurement, residuals: Array, taken: float, anew: bool = False) -> None:
         """Take in the residuals (p, 2) of the outline.
@@ -195,10 +186,6 @@ class OutlineBalance:
         near = np.abs(across) < AGREEING_SIGMAS * max(robust, LEAST_SPREAD_PX)
         variance = robust**2 * len(across) / left
         self.outline.learn(seen.pixels[used][near], across[near, None], float(variance))
-
-    def learn_texture(self, pixels: Array, residuals: Array, variance: float) -> None:
-        """Take in the residuals (p, 2) of the points at ``pixels`` (p, 2) that agree, and a number's variance."""
-        self.texture.learn(pixels, residuals, variance)
 
 
 def mean_square(residuals: Array, weights: Array, n_unknowns: int) -> float:
@@ -236,19 +223,19 @@ def _alike(pixels, counts, length):
 
 
 @njit(cache=True, nogil=True)
-def near_products(pixels, residuals, near):
-    """Mean product, by number, of residuals (p, k) of points within ``near`` pixels, and their mean distance."""
+def near_products(pixels, residuals):
+    """Mean product, by number, of residuals (p, k) of points within `NEAR_PX`, and their mean distance."""
     total, apart, pairs = 0.0, 0.0, 0
     for i in range(len(pixels)):
         for j in range(i):
             squared = (pixels[i, 0] - pixels[j, 0]) ** 2 + (pixels[i, 1] - pixels[j, 1]) ** 2
-            if squared < near * near:
+            if squared < NEAR_PX * NEAR_PX:
                 pairs += 1
                 apart += np.sqrt(squared)
                 for k in range(residuals.shape[1]):
                     total += residuals[i, k] * residuals[j, k]
     if pairs == 0:
-        return 0.0, near
+        return 0.0, NEAR_PX
     return total / (pairs * residuals.shape[1]), max(apart / pairs, 1.0)
 
 

@@ -197,9 +197,7 @@ def reference_correction(
     common_px : as in `of_common_errors`.
     """
     count, state = len(texture.frame.usable), found.state
-    _, hessian, gradient, residuals = estimator.evaluate(
-        together.points, together.pixels, together.weights, state, together.normals, prior, together.depths
-    )
+    _, hessian, gradient, residuals = estimator.evaluated(together, state, prior)
     jacobian, outline = estimator.jacobian(together.points, state)[count:], slice(count, None)
     across = np.einsum("pkn,pk->pn", jacobian, together.normals[outline])
     off = np.einsum("pk,pk->p", residuals[outline], together.normals[outline])

@@ -117,9 +117,7 @@ class RigEstimator:
         size = len(state.parameters) + 6
         cost, hessian, gradient, residuals = 0.0, np.zeros((size, size)), np.zeros(size), []
         for single, part, chain, view in zip(self._single, self.cameras, self._chains, measured.views, strict=True):
-            found = single.evaluate(
-                view.points, view.pixels, view.weights, part.seen(state), view.normals, depths=view.depths
-            )
+            found = single.evaluated(view, part.seen(state))
             cost += found[0]
             hessian += chain.T @ found[1] @ chain
             gradient += chain.T @ found[2]
@@ -134,11 +132,8 @@ class RigEstimator:
         options, first = self.options, self._single[0]
         found = minimise(
             lambda state: self.evaluate(measured, state, prior),
-            start,
-            self.known.bounded(first.box),
-            options.max_iterations,
-            options.tolerance,
-        )
+            start, self.known.bounded(first.box), options.max_iterations, options.tolerance,
+        )  # fmt: skip
         return first.finished(found, measured.weights, measured.numbers)
 
     def linear(self, measured: RigObservations, estimate: Estimate) -> LinearCost:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morph_dslam.tracking.depth import SCALE_STD, PointDepths
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import Estimate, Prior
 from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
@@ -44,7 +44,7 @@ class CameraView:
     weights: Array
     depths: PointDepths | None
     of_others: Array
-    corrected: ReferenceCorrection | None = None
+    corrected: ReferenceCorrection | None
 
     @property
     def unexplained(self) -> Unexplained:
@@ -71,29 +71,23 @@ class RigErrors:
     trackers : by camera, each at its one reference view, which knows how its images are off by the error
         factors that are the same for all.
     cameras : of the rig.
-    scales : by camera, of its depths; by default as well known as usual. Each depth camera has a scale of its own.
+    scales : by camera, of its depths. Each depth camera has a scale of its own.
     """
 
     def __init__(
-        self,
-        trackers: Sequence[Tracker],
-        cameras: Sequence[RigCamera],
-        scales: Sequence[CommonDepthScale] | None = None,
+        self, trackers: Sequence[Tracker], cameras: Sequence[RigCamera], scales: Sequence[CommonDepthScale]
     ) -> None:
         parts = [part for tracker in trackers for part in tracker.reference.parts]
         self._is_known = all(part.error_factors is not None for part in parts)
-        self._cameras, self._scale = cameras, trackers[0].estimator.scale
-        self._chains = [part.chain(len(self._scale) - 6) for part in cameras]
-        self._depth_scales = [CommonDepthScale(SCALE_STD)] * len(cameras) if scales is None else scales
+        self._trackers, self._cameras, self._scale = trackers, cameras, trackers[0].estimator.scale
+        self._chains, self._depth_scales = [part.chain(len(self._scale) - 6) for part in cameras], scales
         self._systematic = [
             SystematicErrors(
                 tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW,
                 scale=scale if scale.in_reference else None,
             )
-            for tracker, scale in zip(trackers, self._depth_scales, strict=True)
+            for tracker, scale in zip(trackers, scales, strict=True)
         ]  # fmt: skip
-        self._points = [tracker.reference.points for tracker in trackers]
-        self._estimators = [tracker.estimator for tracker in trackers]
 
     def added(
         self,
@@ -123,8 +117,7 @@ class RigErrors:
             hessian = hessian + prior.terms(estimate.state)[1]
         if known is not None:
             hessian = hessian + known
-        gain, covariance = inverse_of_seen(hessian, self._scale), estimate.covariance
-        stated = covariance
+        gain, covariance, stated = inverse_of_seen(hessian, self._scale), estimate.covariance, estimate.covariance
         for (view, frame), px, paths in zip(both, common_px, blurred or [None] * len(both), strict=True):
             moved = view.systematic.pushed_by_model(frame, view.chain, gain, px)
             covariance = covariance + moved @ moved.T
@@ -147,10 +140,10 @@ class RigErrors:
         Huber's cost lets them pull no more than they do.
         """
         moved = [np.empty((len(hessian), 0))]
-        for scale, points, view in zip(self._depth_scales, self._points, views, strict=True):
+        for scale, tracker, view in zip(self._depth_scales, self._trackers, views, strict=True):
             if view.depths is None or not scale.std or scale.in_reference:
                 continue
-            state = view.estimate.state
+            state, points = view.estimate.state, tracker.reference.points
             ratio = view.depths.ratio_to(points.in_camera(state)[:, 2])
             off = float(np.hypot(scale.std, 0.0 if ratio is None else ratio - 1.0))
             now = view.depths.terms(points, state)
@@ -171,28 +164,20 @@ class RigErrors:
 
         ``corrected`` : by camera as in `CameraView`; None for none.
         """
-        views, first, corrections = [], 0, corrected or [None] * len(self._cameras)
-        for part, chain, systematic, points, estimator, view, correction in zip(
-            self._cameras, self._chains, self._systematic, self._points, self._estimators, measured.views, corrections,
-            strict=True,
+        views, corrections = [], corrected or [None] * len(self._cameras)
+        for part, chain, systematic, tracker, view, residuals, correction in zip(
+            self._cameras, self._chains, self._systematic, self._trackers, measured.views,
+            measured.split(estimate.residuals), corrections, strict=True,
         ):  # fmt: skip
-            count = len(points)
-            seen = replace(
-                estimate, state=part.seen(estimate.state), residuals=estimate.residuals[first : first + count]
-            )
-            texture, outline = np.arange(count), np.arange(count, len(view.weights))
-            depths = None if view.depths is None else view.depths.take(texture)
-            of_others = estimator.of_pixels(
-                view.points.take(outline),
-                view.pixels[outline],
-                view.weights[outline],
-                seen.state,
-                view.normals[outline],
-            )[1]
+            points, state = tracker.reference.points, part.seen(estimate.state)
+            count, others = len(points), np.arange(len(points), len(view.weights))
+            outline = view.pixels[others], view.weights[others], state, view.normals[others]
+            of_others = tracker.estimator.of_pixels(view.points.take(others), *outline)[1]
+            depths = None if view.depths is None else view.depths.take(np.arange(count))
             if depths is not None:
-                of_others = of_others + depths.terms(points, seen.state)[1]
+                of_others = of_others + depths.terms(points, state)[1]
+            seen = replace(estimate, state=state, residuals=residuals[:count])
             views.append(CameraView(chain, systematic, seen, view.weights[:count], depths, of_others, correction))
-            first += len(view.weights)
         return views
 
 

@@ -30,7 +30,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from morph_dslam.camera import Camera
 from morph_dslam.tracking.covariance import BoundPart, SharedErrors
 from morph_dslam.tracking.depth import PointDepths, weighted_depths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
@@ -88,7 +87,9 @@ class SystematicErrors:
         self._estimator, self._points, self._still = estimator, points, still
         self._misfit = ReferenceMisfit()
         self._corners = points.corners(estimator.model)
-        edges = _by_parts(parts, lambda state: _edges(estimator.camera, self._corners, state))
+        pixels = [estimator.camera.project(self._corners.in_camera(part.state)).reshape(-1, 3, 2) for part in parts]
+        corners = np.concatenate([found[part.rows] for found, part in zip(pixels, parts, strict=True)])
+        edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)  # as columns
         size = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             adjugate = np.stack([edges[:, 1, 1], -edges[:, 0, 1], -edges[:, 1, 0], edges[:, 0, 0]], axis=1)
@@ -233,7 +234,7 @@ class SystematicErrors:
         stated = estimate.covariance
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
-            push = self._pushed_by(moved, frame, estimate.state, depths)
+            push = self.pushed(frame, estimate.state, depths, moved)
             push = push if corrected is None else push @ corrected.left
             push = push + past @ self._by_reference
             by_reference = gain @ push
@@ -303,16 +304,16 @@ class SystematicErrors:
         share = self._common.share_left(frame.usable, both.jacobian, gradients, taken, n_pairs)
         return BeyondReference(float(common), self._common.chance(noise, n_pairs), share, noise)
 
-    def pushed(self, frame: Linearization, state: State, depths: PointDepths | None = None) -> Array:
+    def pushed(
+        self, frame: Linearization, state: State, depths: PointDepths | None = None, moved: Array | None = None
+    ) -> Array:
         """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters a frame's estimate.
 
-        With ``depths`` (p,) of the points, also how it enters by these.
+        With ``depths`` (p,) of the points, also how it enters by these; ``moved`` are `_moved` in the frame, if known.
         """
-        assert self._moved is not None
-        return self._pushed_by(self._warped(state, self._moved), frame, state, depths)
-
-    def _pushed_by(self, moved: Array, frame: Linearization, state: State, depths: PointDepths | None) -> Array:
-        """`pushed`, where the error factors move the pixels by ``moved`` (p, 2, c) in the frame."""
+        if moved is None:
+            assert self._moved is not None
+            moved = self._warped(state, self._moved)
         by_pixels = frame.products(moved)
         if depths is None:
             return by_pixels
@@ -405,8 +406,7 @@ class SystematicErrors:
         of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
             what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        by_reference = self._widening * self._by_reference
-        return partial(self._of_deformation, state, by_reference, by_known, of_model)
+        return partial(self._of_deformation, state, self._widening * self._by_reference, by_known, of_model)
 
     def _of_deformation(
         self,
@@ -429,7 +429,7 @@ class SystematicErrors:
         if self._moved is not None:
             pixels = self._estimator.camera.project(state.camera_from_object.apply(self._corners.rest))
             at_rest = _warped_motions(pixels, self._inverse_edges, self._moved)
-            of_reference += np.sqrt(self._misfit.factor) * (at_rest - self._warped(state, self._moved))
+            of_reference += self.reference_factor * (at_rest - self._warped(state, self._moved))
         not_made_good = by_state @ by_known[:, : len(changes)] @ changes
         return np.concatenate([of_reference, not_made_good, all_columns[:, :, d : d + m]], axis=2)
 
@@ -475,14 +475,3 @@ def _warped_motions(pixels, inverse_edges, moved):
                 for k in range(moved.shape[2]):
                     found[j, row, k] = warp[row, 0] * moved[j, 0, k] + warp[row, 1] * moved[j, 1, k]
     return found
-
-
-def _by_parts(parts: Sequence[BoundPart], of_state: Callable[[State], Array]) -> Array:
-    """What ``of_state`` gives for all points (p, ...), of each part's points in its own state."""
-    return np.concatenate([of_state(part.state)[part.rows] for part in parts])
-
-
-def _edges(camera: Camera, corners: BoundPoints, state: State) -> Array:
-    """Two edges of each triangle in the image, as the columns of (p, 2, 2)."""
-    pixels = camera.project(corners.in_camera(state)).reshape(-1, 3, 2)
-    return np.stack([pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]], axis=2)

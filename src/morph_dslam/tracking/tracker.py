@@ -274,7 +274,7 @@ class Tracker:
                 self._begin(image)
             if isinstance(frame, Frame) and self._gaps.after_gap(frame.timestamp):
                 self._lost = True
-                self._forget_loads()
+                self._see_nothing()
             return image
 
     def _predict(self, camera: CameraLocalization) -> Prior | None:
@@ -307,7 +307,8 @@ class Tracker:
         estimation = self._view.estimation
         if self.reference.outline_alone:
             start = self._last if self._lost else self._start
-            return estimation.by_outline(image, start if prior is None else prior.placed(start), prior, self._lost)
+            start = start if prior is None else prior.placed(start)
+            return estimation.alone.estimate(image, start, prior, self._lost)
         if followed is None:
             start = self._last if prior is None else prior.placed(self._last)
             hypothesis = estimation.correct(image, start, None, prior)
@@ -365,20 +366,10 @@ class Tracker:
 
     def _refine(self, image: Image, hypothesis: PoseHypothesis, camera: CameraLocalization) -> PoseHypothesis:
         """Add outline, depth, what earlier frames tell of per-sequence parameters, and the discrepancy."""
-        estimation = self._view.estimation
-        estimation.weigh_known(hypothesis)
-        with stage("search"):  # of one that was found otherwise than by `_search`, too
-            hypothesis = estimation.in_likelier_tilt(hypothesis)
-        if not hypothesis.outline_alone:
-            hypothesis = replace(hypothesis, by_points=hypothesis.estimate.state)
-        with stage("outline"):
-            hypothesis = estimation.fit_outline(image, hypothesis, self._view.systematic)
-        with stage("depth"):
-            hypothesis = estimation.fit_depths(image, hypothesis, self._view.systematic)
-        with stage("search"):
-            hypothesis = estimation.with_other_tilt(hypothesis)
+        estimation, systematic = self._view.estimation, self._view.systematic
+        hypothesis = estimation.with_all(image, hypothesis, systematic)
         with stage("fuse"):
-            self.last_measured = measured = estimation.measured(hypothesis)
+            self.last_measured = measured = estimation.beside.measured(hypothesis, correlated=True)
             estimate = self._filter.fuse(measured, hypothesis.estimate, hypothesis.prior)
             if not hypothesis.outline_alone:
                 estimate = replace(estimate, residuals=estimate.residuals[: len(hypothesis.inliers)])
@@ -390,8 +381,8 @@ class Tracker:
                 hypothesis = replace(hypothesis, discrepancy=self._beyond)
         if not self._lost:
             with stage("correct"):
-                systematic = None if self._view.number or not self._in_sequence else self._view.systematic
-                warped = None if systematic is None else systematic.warped
+                is_later = self._view.number or not self._in_sequence
+                warped = None if is_later or systematic is None else systematic.warped
                 hypothesis = estimation.with_blur(image, hypothesis, self._last_by_points, warped)
         self.last_blurred, self.last_correction = hypothesis.blurred, hypothesis.correction
         if camera.pose_prior is not None and not hypothesis.outline_alone:
@@ -406,9 +397,7 @@ class Tracker:
             self._learn(image, hypothesis)
         else:
             self._filter.go_on()
-            self.last_measured, self.last_blurred = self.reference.nothing_measured, None
-            self.last_correction = None
-            self._forget_loads()
+            self._see_nothing()
             placed = self._placed_by_map(camera)
             if placed is not None:
                 self._last = self._last_by_points = replace(self._last, camera_from_object=placed.pose)
@@ -416,8 +405,10 @@ class Tracker:
         self._image, self._lost = image, rejection is not None
         self._n_lost = self._n_lost + 1 if self._lost else 0
 
-    def _forget_loads(self) -> None:
-        """Any loads may act by the next frame."""
+    def _see_nothing(self) -> None:
+        """Nothing is measured, and any loads may act by the next frame."""
+        self.last_measured, self.last_blurred, self.last_correction = self.reference.nothing_measured, None, None
+        self.last_doubt_px = 0.0
         if self.estimator.loads is not None:
             self.estimator.loads.forget()
 
@@ -437,8 +428,7 @@ class Tracker:
             told = warnings if placed is None else self.estimator.known.warnings
             result = lost_result(self.model, hypothesis, rejection, placed, told)
         else:
-            errors = self._model_errors
-            result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings, errors)
+            result = tracked_result(self.model, hypothesis, self._view, self._filter, warnings, self._model_errors)
             is_still = self.options.pose == "still"
             result = replace(result, found_by=found_by, pose_from=pose_source(hypothesis, is_still), jumps=self.jumps)
         return replace(result, view=number, motion=self._image.motion, modulus_std=self.options.modulus_std)
@@ -523,10 +513,8 @@ class Tracker:
         if timestamp is not None:
             self._gaps.after_gap(timestamp)
         if self._views is not None:  # before the first frame nothing is followed that could be lost
-            self.last_measured, self.last_blurred, self._lost = self.reference.nothing_measured, None, True
-            self.last_doubt_px, self.last_correction = 0.0, None
-            self._n_lost += 1
-            self._forget_loads()
+            self._lost, self._n_lost = True, self._n_lost + 1
+            self._see_nothing()
         rejection = Rejection(RejectionReason.NO_PICTURE)
         return FrameResult(self.model, Status.LOST, rejection=rejection, timings_ms=dict.fromkeys(STAGES, 0.0))
 
