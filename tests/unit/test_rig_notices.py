@@ -77,7 +77,10 @@ def test_depth_that_does_not_count_is_named_and_a_camera_beside_one_that_has_dep
 
 @pytest.mark.parametrize("factor", [1.005, 1.01, 1.02])
 def test_the_scale_of_the_second_cameras_depths_is_not_known_with_that_of_the_first(scene, factor):
-    """What the depths pull is bounded: from half a deviation on the sheet is off by half a millimetre."""
+    """Held by the first one's, the sheet would be off by half a millimetre from half a deviation on.
+
+    The texture of both cameras and the first one's depths tell the second scale.
+    """
     rng, middle = np.random.default_rng(0), MODEL.nodes.mean(axis=0)[None]
     frames = [
         Frame(0, 0.0, image, np.float32(scale) * sheet_depth(MODEL, part.seen(sheet_state(0.32)), rng))
@@ -88,8 +91,7 @@ def test_the_scale_of_the_second_cameras_depths_is_not_known_with_that_of_the_fi
     rig = RigTracker(MODEL, RIG, known, TrackerOptions(use_depth=True), references=scene.references)
     found = rig.track(frames)
     off = found.estimate.state.camera_from_object.apply(middle) - sheet_state(0.32).camera_from_object.apply(middle)
-    assert abs(off[0, 2]) > 0.4e-3
-    assert 0.5 * abs(off[0, 2]) < found.pose_std[5] < 3.0 * abs(off[0, 2])
+    assert abs(off[0, 2]) < min(0.05e-3, 3.0 * found.pose_std[5])
 
 
 @pytest.mark.parametrize("start", ["previous", "constant-velocity"])
