@@ -26,7 +26,8 @@ STUDY = {
         "lift": {"range": ["-60 mm", "60 mm"]},
         "ratio": {"range": [0.25, 4.0], "default": 1.0, "description": "stiffness of the tip over the root's"},
     },
-    "sampling": {"scheme": "grid", "points": [7, 6], "held_out": 4, "seed": 1},
+    # The film is of this mesh. A finer one would move the ratio by a quarter and more, and stated deviations hold that.
+    "sampling": {"scheme": "grid", "points": [7, 6], "held_out": 4, "refined": 0, "seed": 1},
     "reduction": {"method": "pod", "tolerance": 1e-4},
 }
 SCENE = """
