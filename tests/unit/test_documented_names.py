@@ -60,9 +60,12 @@ def test_every_key_is_documented(pages, roots, n_keys):
 
 
 def test_every_law_and_its_constants_are_documented():
+    """Of this package: other tests register laws of their own."""
+    ours = {name for name, law in laws().items() if law.__module__.startswith("morph_dslam.")}
+    assert len(ours) > 10
     for page in ("solid-study", "materials"):
-        assert set(laws()) - code_words(page) == set()
-    constants = {name for law in laws() for name in constant_quantities(law)}
+        assert ours - code_words(page) == set()
+    constants = {name for law in ours for name in constant_quantities(law)}
     assert constants - code_words("solid-study") == set()
 
 
