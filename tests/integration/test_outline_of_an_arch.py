@@ -6,27 +6,15 @@ import numpy as np
 import pytest
 
 import morph_dslam as md
-from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.estimator import BoundPoints, Estimator
 from morph_dslam.tracking.state import State, pose_increment
+from tests.support.clicked import clicked
 from tests.support.scenes import write_scene
 
-CLICK_PX, N_CLICKS, N_REGISTRATIONS = 1.0, 14, 8
+N_REGISTRATIONS = 8
 STILL = (
     "[sensor]\nnoise = 1.0\n[[parameters]]\nframe = 0\narch = 20.0\nskew = 0.2\ntwist = 4.0\n"
     "[[pose]]\nframe = 0\nposition_mm = [0.0, 80.0, 640.0]\nrotation_deg = [190.0, 8.0, 0.0]\n"
 )
-
-
-def clicked(model, camera, there, rng):
-    """The sheet in the state that clicks on its nodes give, with the covariance that their deviation gives it."""
-    chosen = rng.choice(len(model.triangles), N_CLICKS, replace=False)
-    points = BoundPoints.from_surface(model, SurfacePoints(chosen, np.tile([1.0, 0.0, 0.0], (N_CLICKS, 1))))
-    pixels = camera.project(points.in_camera(there)) + CLICK_PX * rng.standard_normal((N_CLICKS, 2))
-    estimator, weights = Estimator(model, camera), np.ones(N_CLICKS)
-    found = estimator.estimate(points, pixels, weights, there)
-    hessian = estimator.evaluate(points, pixels, weights, found.state)[1]
-    return md.Registration(model, found.state, CLICK_PX**2 * np.linalg.inv(hessian))
 
 
 def still_film(folder, frames, readout_s=0.0):
