@@ -60,10 +60,12 @@ lint: $(INSTALLED) $(TYPES)
 	@$(BIN)/ruff check --quiet
 	@$(BIN)/lint-imports
 
-# Types are checked where a module has changed, come or gone since they were found right: that takes minutes.
+# Types are checked where a module has changed, come or gone since they were found right: that takes minutes. What is
+# edited meanwhile is checked the next time.
 $(TYPES): $(INSTALLED) $(shell find src -name '*.py' -o -type d -not -name __pycache__)
+	@touch $@.begun
 	@$(BIN)/pyright --warnings
-	@touch $@
+	@mv $@.begun $@
 
 # The site, in build/site: open build/site/index.html. Pictures of the studio follow its pages where Chromium is present.
 docs: $(INSTALLED)

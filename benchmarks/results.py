@@ -51,9 +51,9 @@ def commit() -> str:
 
 
 def keep(name: str, output: str, day: str, of_commit: str) -> None:
-    """Keep the last lines of an output, without progress bars and lines that only name a file."""
+    """Keep the last lines of an output, without what says how far it is and lines that only name a file."""
     lines = [line.rpartition("\r")[2].rstrip() for line in output.split("\n")]
-    lines = [line for line in lines if line and not re.search(r"\d+%\||^\w+ +/\S+$", line)]
+    lines = [line for line in lines if line and not re.search(r"\d+%\||^\w+ +/\S+$|\.\.\.$", line)]
     kept = [re.sub(r"/\S*/(?=(?:examples|benchmarks|demo)/)", "", line) for line in lines[-BENCHMARKS[name].lines :]]
     content = {"date": day, "commit": of_commit, "command": BENCHMARKS[name].command, "machine": machine()}
     KEPT.mkdir(exist_ok=True)
