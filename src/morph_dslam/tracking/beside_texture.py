@@ -254,7 +254,8 @@ class BesideTexture:
             points = self._last_joined[1]
             pixels, normals = np.concatenate([pixels, seen.pixels]), np.concatenate([normals, seen.normals])
             weights = np.concatenate([weights, seen.weights])
-        return Observations(points, pixels, weights, normals, correlation, depths)
+        common_px = 0.0 if seen is None else self.balance.common_px
+        return Observations(points, pixels, weights, normals, correlation, depths, common_px)
 
 
 def weighed_by_residuals(depths: PointDepths, residuals: Array, pixels: Array) -> PointDepths:

@@ -47,6 +47,8 @@ class LinearCost:
     hessian : (n, n).
     scale : (n,) of the unknowns.
     correlation : (p, p) of the points' errors.
+    in_common : (k, n) by which errors of whole outlines, each in its deviation, enter the gradient; the same in all
+        frames.
     """
 
     weighted_jacobian: Array
@@ -54,6 +56,7 @@ class LinearCost:
     hessian: Array
     scale: Array
     correlation: Correlation
+    in_common: Array
 
     @classmethod
     def about(
@@ -61,27 +64,31 @@ class LinearCost:
     ) -> LinearCost:
         """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
         points, seen = measured.points, (residuals, measured.weights, measured.normals, huber_px)
-        weighted_jacobian, hessian = weighted_derivatives(*points.in_state(state), camera.intrinsics, *seen)
+        found = weighted_derivatives(*points.in_state(state), camera.intrinsics, *seen)
+        weighted_jacobian, hessian, of_one_px = found
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)
             hessian, of_depths = hessian + part, measured.depths.variance_px(far) * part
-        return cls(weighted_jacobian, of_depths, hessian, scale, measured.correlation)
+        in_common = measured.common_px * of_one_px
+        return cls(weighted_jacobian, of_depths, hessian, scale, measured.correlation, in_common)
 
     def in_unknowns(self, chain: Array) -> LinearCost:
         """The same cost of other unknowns, whose increments ``chain`` (n, m) turns into these."""
         hessian, of_depths = (chain.T @ matrix @ chain for matrix in (self.hessian, self.of_depths))
-        return LinearCost(self.weighted_jacobian @ chain, of_depths, hessian, self.scale, self.correlation)
+        rows, in_common = self.weighted_jacobian @ chain, self.in_common @ chain
+        return LinearCost(rows, of_depths, hessian, self.scale, self.correlation, in_common)
 
     def holding(self, indices: NDArray[np.int64]) -> LinearCost:
         """The same cost with the unknowns at ``indices`` (k,) known: how well the others are then."""
         rows, of_depths, hessian = self.weighted_jacobian.copy(), self.of_depths.copy(), self.hessian.copy()
         largest = float(np.max(np.diag(hessian) * self.scale**2))
-        rows[:, :, indices] = 0.0
+        in_common = self.in_common.copy()
+        rows[:, :, indices], in_common[:, indices] = 0.0, 0.0
         for matrix in (of_depths, hessian):
             matrix[indices], matrix[:, indices] = 0.0, 0.0
         hessian[indices, indices] = max(largest, 1e-30) / self.scale[indices] ** 2
-        return LinearCost(rows, of_depths, hessian, self.scale, self.correlation)
+        return LinearCost(rows, of_depths, hessian, self.scale, self.correlation, in_common)
 
     def with_known(self, hessian: Array) -> LinearCost:
         """The same cost with what is known of the unknowns beforehand in its Hessian (n, n).
@@ -104,6 +111,7 @@ class LinearCost:
             np.sum([cost.hessian for cost in costs], axis=0),
             costs[0].scale,
             correlation,
+            np.concatenate([cost.in_common for cost in costs]),
         )
 
     @cached_property

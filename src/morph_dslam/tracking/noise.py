@@ -32,6 +32,8 @@ class Observations:
     normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
     correlation : (p, p) of the errors of the points' measurements; empty where nobody asks for it.
     depths : where a depth camera saw them.
+    common_px : what the points with normals may be off by together, a standard deviation, pixels: by a shift in either
+        direction, and by one outwards; the same in all frames.
     """
 
     points: BoundPoints
@@ -40,6 +42,7 @@ class Observations:
     normals: Array
     correlation: Correlation = field(default_factory=lambda: np.zeros((0, 0)))
     depths: PointDepths | None = None
+    common_px: float = 0.0
 
     @property
     def numbers(self) -> NDArray[np.int64]:

@@ -201,7 +201,8 @@ def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsi
     """Jacobian (p, 2, d + 6) by which an error of a pixel enters the gradient, and the Hessian (d + 6, d + 6).
 
     The first is Huber's factor times the root of the weight times the pixel's Jacobian, along its normal where it has
-    one; zero where a point does not count.
+    one; zero where a point does not count. With them comes how errors (3, d + 6) enter the gradient that all points
+    with normals have in common, of one pixel each: one outwards, and two along the axes of the image.
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsi
     """
     _, jacobian = project_with_jacobian(functions, rotation, translation, rest, modes, intrinsics)
     n_points, size = len(rest), jacobian.shape[2]
-    rows = np.zeros((size, 2 * n_points))
+    rows, in_common = np.zeros((size, 2 * n_points)), np.zeros((3, size))
     for j in range(n_points):
         across, down = jacobian[j, 0], jacobian[j, 1]
         length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
@@ -218,14 +219,18 @@ def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsi
             across[:], down[:] = 0.0, 0.0
             continue
         n0, n1 = normals[j, 0], normals[j, 1]
+        factor = min(1.0, huber / max(length, 1e-300))
         if n0 != 0.0 or n1 != 0.0:
             for a in range(size):
                 slope = n0 * across[a] + n1 * down[a]
                 across[a], down[a] = n0 * slope, n1 * slope
-        factor = min(1.0, huber / max(length, 1e-300))
+                push = factor * weights[j] * slope
+                in_common[0, a] += push
+                in_common[1, a] += n0 * push
+                in_common[2, a] += n1 * push
         root, scale = np.sqrt(factor * weights[j]), factor * np.sqrt(weights[j])
         for a in range(size):
             rows[a, j], rows[a, n_points + j] = root * across[a], root * down[a]
             across[a], down[a] = scale * across[a], scale * down[a]
     hessian = products_of_rows(rows)
-    return jacobian, hessian
+    return jacobian, hessian, in_common

@@ -471,7 +471,7 @@ class SequenceFilter(Generic[Frame]):
             hessian += information
             by_frames += known.new_in_frame(information)
         # What a frame does not tell is no better known by many: one more cause that stays the same.
-        by_factor = np.vstack([self._unobservable @ hessian[self._constant], by_factor])
+        by_factor = np.vstack([self._unobservable @ hessian[self._constant], linear.in_common, by_factor])
         if past is not None and self._past is not None:
             hessian[:d, :d] += past.information
             weight = self._of_kept(past.information)
