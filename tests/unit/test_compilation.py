@@ -1,17 +1,24 @@
-"""The first use says that it takes long; later ones say nothing."""
+"""The first use says that it takes long; later ones say nothing. What takes longest to compile is not used."""
 
+import ast
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
+import pytest
 
+import morph_dslam
 from morph_dslam.extend.geometry import RigidTransform
 from morph_dslam.extend.tracking import BoundPoints, Estimator, State
 from morph_dslam.model import SurfacePoints
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA
 
+SOURCES = sorted(Path(morph_dslam.__file__).parent.rglob("*.py"))
+#: numba takes from half a second to four to compile one of these, in each process that compiles a loop with it.
+DEAR = {"append", "argsort", "cross", "diff", "median", "outer", "ptp", "solve", "where"}
 #: Twice, as a registration and a tracker do.
 PROGRAM = """
 from morph_dslam.tracking.compilation import announce_compilation
@@ -32,3 +39,23 @@ def test_compilation_is_announced_once_and_only_the_first_time(tmp_path):
     state = State(model.default, RigidTransform(np.eye(3), np.array([0.0, 0.0, 1.0])))
     Estimator(model, CAMERA).evaluate(points, np.zeros((1, 2)), np.ones(1), state)
     assert said() == ""
+
+
+def is_compiled(node):
+    return isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(word) for word in node.decorator_list)
+
+
+def dear_in(text):
+    loops = [node for node in ast.walk(ast.parse(text)) if is_compiled(node)]
+    calls = [node.func for loop in loops for node in ast.walk(loop) if isinstance(node, ast.Call)]
+    return [ast.unparse(name) for name in calls if isinstance(name, ast.Attribute) and name.attr in DEAR]
+
+
+def test_what_is_dear_is_found():
+    text = "@njit(cache=True)\ndef loop(a):\n    return np.linalg.solve(a, a)\ndef other(a):\n    return np.median(a)"
+    assert dear_in(text) == ["np.linalg.solve"]
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if "njit" in path.read_text(encoding="utf-8")], ids=str)
+def test_compiled_loops_use_nothing_that_is_dear_to_compile(path):
+    assert not dear_in(path.read_text(encoding="utf-8"))

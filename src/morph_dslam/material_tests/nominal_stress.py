@@ -10,6 +10,7 @@ to row of a test, however far apart they are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -175,21 +176,23 @@ def relaxed_stress(instantaneous: Array, time: Array, moduli: Array, times: Arra
     times : (m,) relaxation times, s.
     """
     n, k = instantaneous.shape
-    overstress = np.outer(moduli, instantaneous[0])
-    equilibrium = 1.0 - moduli.sum()
-    stress = np.empty((n, k))
-    stress[0] = instantaneous[0]
+    overstress, stress, viscous = np.empty((len(moduli), k)), np.empty((n, k)), 0.0
+    for i in range(len(moduli)):
+        viscous += moduli[i]
+    for c in range(k):
+        stress[0, c] = instantaneous[0, c]
+        for i in range(len(moduli)):
+            overstress[i, c] = moduli[i] * instantaneous[0, c]
     for j in range(1, n):
-        step = (time[j] - time[j - 1]) / times
-        decay = np.exp(-step)
-        kept = -np.expm1(-step) / step
         for c in range(k):
-            change = instantaneous[j, c] - instantaneous[j - 1, c]
-            total = equilibrium * instantaneous[j, c]
-            for i in range(len(moduli)):
-                overstress[i, c] = decay[i] * overstress[i, c] + moduli[i] * kept[i] * change
-                total += overstress[i, c]
-            stress[j, c] = total
+            stress[j, c] = (1.0 - viscous) * instantaneous[j, c]
+        for i in range(len(moduli)):
+            step = (time[j] - time[j - 1]) / times[i]
+            decay, kept = math.exp(-step), -math.expm1(-step) / step
+            for c in range(k):
+                change = instantaneous[j, c] - instantaneous[j - 1, c]
+                overstress[i, c] = decay * overstress[i, c] + moduli[i] * kept * change
+                stress[j, c] += overstress[i, c]
     return stress
 
 

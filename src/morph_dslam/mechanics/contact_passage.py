@@ -19,6 +19,7 @@ from morph_dslam.mechanics.contact import RigidCylinder, RigidObstacle, RigidPla
 from morph_dslam.mechanics.contact_surface import ContactSurface
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.mechanics.rigid_mesh import RigidMesh
+from morph_dslam.small_arrays import cross, dot
 
 Array = NDArray[np.float64]
 #: A point has gone through an obstacle if it was inside by more than this part of the depth of the core, ...
@@ -95,9 +96,9 @@ def _windings(points, nodes, triangles):
         for t in range(len(triangles)):
             i, j, m = triangles[t]
             a, b, c = nodes[i] - points[k], nodes[j] - points[k], nodes[m] - points[k]
-            na, nb, nc = np.sqrt(np.dot(a, a)), np.sqrt(np.dot(b, b)), np.sqrt(np.dot(c, c))
-            volume = np.dot(a, np.cross(b, c))
-            flat = na * nb * nc + np.dot(a, b) * nc + np.dot(b, c) * na + np.dot(c, a) * nb
+            na, nb, nc = np.sqrt(dot(a, a)), np.sqrt(dot(b, b)), np.sqrt(dot(c, c))
+            volume = dot(a, cross(b, c))
+            flat = na * nb * nc + dot(a, b) * nc + dot(b, c) * na + dot(c, a) * nb
             windings[k] += np.arctan2(volume, flat) / (2.0 * np.pi)
     return windings
 

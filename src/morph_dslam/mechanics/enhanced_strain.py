@@ -329,20 +329,21 @@ def _add_point(
 
 
 @njit(cache=True, nogil=True)
-def _negative_pivots(matrix: Array) -> int:
-    """Negative eigenvalues of a symmetric matrix, by elimination without pivoting; overwrites it."""
-    n, count = len(matrix), 0
-    for step in range(n):
-        pivot = matrix[step, step]
-        count += pivot < 0.0
-        for row in range(step + 1, n):
-            factor = matrix[row, step] / pivot
-            for column in range(step + 1, n):
-                matrix[row, column] -= factor * matrix[step, column]
+def _negative_pivots(matrices: Array) -> int:
+    """Negative eigenvalues of symmetric matrices (m, n, n), by elimination without pivoting; overwrites them."""
+    (m, n), count = matrices.shape[:2], 0
+    for cell in range(m):
+        matrix = matrices[cell]
+        for step in range(n):
+            pivot = matrix[step, step]
+            count += pivot < 0.0
+            for row in range(step + 1, n):
+                factor = matrix[row, step] / pivot
+                for column in range(step + 1, n):
+                    matrix[row, column] -= factor * matrix[step, column]
     return count
 
 
-@njit(cache=True, nogil=True)
 def condensed_matrices(
     moduli: Array, stress: Array, state: tuple[Array, Array, Array], cells: tuple[Array, Array, Array, Array]
 ) -> tuple[Array, Array, Array, int]:
@@ -358,17 +359,38 @@ def condensed_matrices(
     Returns
     -------
     S = K_uu - K_ua K_aa^-1 K_au (m, 24, 24), K_aa^-1 K_au (m, 12, 24), K_aa (m, 12, 12), and the number of negative
-    eigenvalues of K_aa in all.
+    eigenvalues of K_aa in all. A cell whose tangent is not finite is NaN.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError, ZeroDivisionError
+        If K_aa is singular.
     """
-    (nodal, added, bulk), (modes, growths, centre, volumes) = state, cells
-    (m, q), negative = volumes.shape, 0
-    small = np.full((m, NODAL, NODAL), np.nan)
-    follow = np.full((m, ADDED, NODAL), np.nan)
-    inner = np.full((m, ADDED, ADDED), np.nan)
-    matrix = np.empty((NODAL + ADDED, NODAL + ADDED))
-    turned = np.empty((3, 3, 3))
+    matrices = _tangents(moduli, stress, *state, *cells)
+    coupling, inner = matrices[:, NODAL:, :NODAL], matrices[:, NODAL:, NODAL:]
+    # Not compiled: numba takes four seconds to compile what solves equations.
+    follow = np.linalg.solve(inner, coupling)
+    small = matrices[:, :NODAL, :NODAL] - coupling.transpose(0, 2, 1) @ follow
+    return small, follow, inner, _negative_pivots(inner.copy())
+
+
+@njit(cache=True, nogil=True)
+def _tangents(
+    moduli: Array,
+    stress: Array,
+    nodal: Array,
+    added: Array,
+    bulk: Array,
+    modes: Array,
+    growths: Array,
+    centre: Array,
+    volumes: Array,
+) -> Array:
+    """Tangents (m, 36, 36) of m cells, NaN where one is not finite; for the parameters see `condensed_matrices`."""
+    m, q = volumes.shape
+    matrices, turned = np.zeros((m, NODAL + ADDED, NODAL + ADDED)), np.empty((3, 3, 3))
     for cell in range(m):
-        matrix[:] = 0.0
+        matrix = matrices[cell]
         for point in range(q):
             volume = volumes[cell, point]
             of_point = nodal[cell, point], added[cell, point], bulk[cell, point]
@@ -384,17 +406,15 @@ def condensed_matrices(
                             matrix[3 * a + i, NODAL + 3 * r + k] += both * stress[cell, point, i, k]
                             growth = growths[cell, point, r] * centre[cell, a, k] * volume
                             matrix[3 * a + i, 33 + r] += growth * stress[cell, point, i, k]
+        total = 0.0
         for row in range(NODAL + ADDED):
+            total += matrix[row, row]
             for column in range(row):
                 matrix[row, column] = matrix[column, row]
-        if not np.isfinite(matrix).all():
-            continue
-        coupling = matrix[NODAL:, :NODAL].copy()
-        inner[cell] = matrix[NODAL:, NODAL:]
-        follow[cell] = np.linalg.solve(inner[cell], coupling)
-        small[cell] = matrix[:NODAL, :NODAL] - coupling.T @ follow[cell]
-        negative += _negative_pivots(inner[cell].copy())
-    return small, follow, inner, negative
+                total += matrix[row, column]
+        if not np.isfinite(total):
+            matrix[:, :] = np.nan
+    return matrices
 
 
 @njit(cache=True, nogil=True)

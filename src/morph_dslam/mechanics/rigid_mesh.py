@@ -23,6 +23,7 @@ from morph_dslam.mechanics.contact import Touch, Vector
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.meshing.surface_repair import refined_surface
 from morph_dslam.model.reduced_model import triangle_normals
+from morph_dslam.small_arrays import dot
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -203,9 +204,9 @@ def _nearest(places, candidates, corners, normals):
             for corner in range(3):
                 away += shares[corner] * (places[q] - corners[t, corner])
                 normal += shares[corner] * normals[t, corner]
-            distance = np.sqrt(np.dot(away, away))
+            distance = np.sqrt(dot(away, away))
             if distance < nearest:
-                nearest, side = distance, np.dot(away, normal)
+                nearest, side = distance, dot(away, normal)
         distances[q] = -nearest if side < 0.0 else nearest
     return distances
 
@@ -214,8 +215,8 @@ def _nearest(places, candidates, corners, normals):
 def _foot(corners):
     """Barycentric coordinates (3,) of a triangle's (3, 3) point that is nearest to the origin."""
     first, second = corners[1] - corners[0], corners[2] - corners[0]
-    aa, ab, bb = np.dot(first, first), np.dot(first, second), np.dot(second, second)
-    a, b = -np.dot(corners[0], first), -np.dot(corners[0], second)
+    aa, ab, bb = dot(first, first), dot(first, second), dot(second, second)
+    a, b = -dot(corners[0], first), -dot(corners[0], second)
     size = aa * bb - ab * ab
     s, t = bb * a - ab * b, aa * b - ab * a
     if s >= 0.0 and t >= 0.0 and s + t <= size and size > 0.0:
@@ -223,10 +224,10 @@ def _foot(corners):
     nearest, shares = np.inf, np.zeros(3)
     for k in range(3):
         start, side = corners[k], corners[(k + 1) % 3] - corners[k]
-        along = min(max(-np.dot(start, side) / max(np.dot(side, side), 1e-300), 0.0), 1.0)
+        along = min(max(-dot(start, side) / max(dot(side, side), 1e-300), 0.0), 1.0)
         foot = start + along * side
-        if np.dot(foot, foot) < nearest:
-            nearest = np.dot(foot, foot)
+        if dot(foot, foot) < nearest:
+            nearest = dot(foot, foot)
             shares = np.zeros(3)
             shares[k], shares[(k + 1) % 3] = 1.0 - along, along
     return shares

@@ -26,9 +26,20 @@ KINDS = {"chebyshev": CHEBYSHEV, "spline": SPLINE, "fourier": FOURIER, "kriging"
 
 
 @njit(cache=True, nogil=True)
-def _fill_chebyshev(n, lower, upper, x, out):
+def _continue(n, beyond, out):
+    """Go on from the end of the range, where ``out`` is known, along the tangent."""
+    if beyond != 0.0:
+        for j in range(n):
+            out[0, j] += beyond * out[1, j]
+            out[2, j] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def fill_chebyshev(n, lower, upper, x, out):
+    """`fill_basis` of Chebyshev polynomials."""
+    at = min(max(x, lower), upper)
     scale = 2.0 / (upper - lower)
-    xi = (x - lower) * scale - 1.0
+    xi = (at - lower) * scale - 1.0
     out[:, 0] = 0.0
     out[0, 0] = 1.0
     if n > 1:
@@ -37,6 +48,7 @@ def _fill_chebyshev(n, lower, upper, x, out):
         out[0, j] = 2.0 * xi * out[0, j - 1] - out[0, j - 2]
         out[1, j] = 2.0 * scale * out[0, j - 1] + 2.0 * xi * out[1, j - 1] - out[1, j - 2]
         out[2, j] = 4.0 * scale * out[1, j - 1] + 2.0 * xi * out[2, j - 1] - out[2, j - 2]
+    _continue(n, x - at, out)
 
 
 @njit(cache=True, nogil=True)
@@ -76,7 +88,8 @@ def _fill_spline(n, degree, knots, x, out):
     row[0] = 1.0
     for p in range(1, degree + 1):
         if degree - p < 2:  # degree - 2 and degree - 1 are kept for the derivatives
-            table[degree - p + 1, :p] = row[:p]
+            for j in range(p):
+                table[degree - p + 1, j] = row[j]
         carried = 0.0
         for j in range(p):
             left, right = knots[span + 1 - p + j], knots[span + 1 + j]
@@ -109,17 +122,15 @@ def fill_basis(kind, degree, n, lower, upper, knots, x, out):
     if kind == FOURIER:
         _fill_fourier(n, lower, upper, x, out)
         return
-    at = min(max(x, lower), upper)
     if kind == CHEBYSHEV:
-        _fill_chebyshev(n, lower, upper, at, out)
-    elif kind == SPLINE:
+        fill_chebyshev(n, lower, upper, x, out)
+        return
+    at = min(max(x, lower), upper)
+    if kind == SPLINE:
         _fill_spline(n, degree, knots, at, out)
     else:
         _fill_kriging(n, knots, at, out)
-    if at != x:
-        for j in range(n):
-            out[0, j] += (x - at) * out[1, j]
-            out[2, j] = 0.0
+    _continue(n, x - at, out)
 
 
 @njit(cache=True, nogil=True)

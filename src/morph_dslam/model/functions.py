@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from morph_dslam.model.basis_functions import CHEBYSHEV, fill_basis
+from morph_dslam.model.basis_functions import fill_chebyshev
 from morph_dslam.row_products import row_products
 
 Array = NDArray[np.float64]
@@ -141,15 +141,17 @@ def evaluate_polynomials(mu, lower, upper, degrees, first_term, first_function, 
     functions : (n,) which function each is, group by group.
     coefficients : those of all functions, one function after the other, as many as its group has terms.
     """
-    d, highest, most, begin = len(mu), np.uint16(0), np.max(np.diff(first_term)), 0
+    d, highest, most, begin = len(mu), np.uint16(0), 0, 0
     for k in range(d):
         for t in range(degrees.shape[1]):
             highest = max(highest, degrees[k, t])
+    for group in range(len(first_term) - 1):
+        most = max(most, first_term[group + 1] - first_term[group])
     size = np.int64(highest) + 1
-    tables, knots, result = np.empty((d, 3, size)), np.empty(0), np.empty((1 + d, len(functions)))
+    tables, result = np.empty((d, 3, size)), np.empty((1 + d, len(functions)))
     products, chosen = np.empty((1 + d, most)), np.empty(most)
     for k in range(d):
-        fill_basis(CHEBYSHEV, 0, size, lower[k], upper[k], knots, mu[k], tables[k])
+        fill_chebyshev(size, lower[k], upper[k], mu[k], tables[k])
     for group in range(len(first_term) - 1):
         first, end, last = first_term[group], first_term[group + 1], first_function[group + 1] - 1
         count = end - first

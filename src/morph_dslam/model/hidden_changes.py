@@ -124,7 +124,6 @@ def _tried(place, way, step, share):
     return _inside(place, way + far * step) if far > LEAST_WAY * length else np.empty(0)
 
 
-@njit(cache=True, nogil=True)
 def _turned(place, way, here, rows, products, others, least):
     """A way (f,) turned aside so that the surface moves least, and by how much it does, metres.
 
@@ -135,7 +134,7 @@ def _turned(place, way, here, rows, products, others, least):
     here, rows : values (m,) of the functions at the place, and values and derivatives (1 + f, m) at the way's end.
     products, others, least : as in `HiddenChanges`.
     """
-    change, slopes = rows[0] - here, np.ascontiguousarray(rows[1:])
+    change, slopes = rows[0] - here, rows[1:]
     aside = others @ slopes
     weighted = aside @ products
     normal = weighted @ aside.T + least * np.eye(len(others))
@@ -173,7 +172,9 @@ def _judged(back, moved_back, forth, moved_forth, slope, least):
     share, moments = 1.0, np.zeros((len(back), len(back)))
     for way, moved, length in ((back, moved_back, lengths[0]), (forth, moved_forth, lengths[1])):
         if length > 0.0:
-            moments += length / 3.0 * np.outer(way, way)
+            for a in range(len(way)):
+                for b in range(len(way)):
+                    moments[a, b] += length / 3.0 * (way[a] * way[b])
             if slope * length > 0.0:
                 share = min(share, moved / (slope * length))
     left = (least / (slope**2 + least)) ** 2

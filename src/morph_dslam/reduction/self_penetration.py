@@ -22,6 +22,7 @@ from morph_dslam.mechanics.contact import RigidObstacle
 from morph_dslam.mechanics.contact_passage import core_inside
 from morph_dslam.mechanics.parameters import ParameterSymbols
 from morph_dslam.model import Parameter
+from morph_dslam.small_arrays import cross, dot
 from morph_dslam.studies.problem import ModelMesh, Snapshot
 
 Array = NDArray[np.float64]
@@ -333,12 +334,13 @@ def winding_numbers(asked, nodes, normals, triangles, longest):
 def _distance(corners):
     """Distance of a triangle (3, 3) from the origin: of its plane where the foot is inside, of its sides else."""
     nearest, inside = np.inf, True
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normal = cross(corners[1] - corners[0], corners[2] - corners[0])
     for k in range(3):
         corner, side = corners[k], corners[(k + 1) % 3] - corners[k]
-        share = min(max(-np.dot(corner, side) / max(np.dot(side, side), 1e-300), 0.0), 1.0)
-        nearest = min(nearest, np.linalg.norm(corner + share * side))
-        inside = inside and np.dot(np.cross(corner, side), normal) > 0.0
+        share = min(max(-dot(corner, side) / max(dot(side, side), 1e-300), 0.0), 1.0)
+        foot = corner + share * side
+        nearest = min(nearest, np.sqrt(dot(foot, foot)))
+        inside = inside and dot(cross(corner, side), normal) > 0.0
     if inside:
-        nearest = abs(np.dot(corners[0], normal)) / np.linalg.norm(normal)
+        nearest = abs(dot(corners[0], normal)) / np.sqrt(dot(normal, normal))
     return nearest

@@ -229,13 +229,15 @@ def sweep(image, others, turns, shifts, pixels, inverse_depths, half):
     found, best, second = np.zeros(n), np.full(n, -1.0), np.full(n, -1.0)
     for p in range(n):
         x, y = pixels[p]
-        k = 0
+        k = total = square = 0
         for j in range(-half, half + 1):
             for i in range(-half, half + 1):
                 patch[k] = image[y + j, x + i]
+                total += patch[k]
+                square += patch[k] * patch[k]
                 k += 1
-        mean = np.mean(patch)
-        variance = np.mean(patch * patch) - mean * mean
+        mean = total / k
+        variance = square / k - mean * mean
         if variance < LEAST_VARIANCE:
             continue
         deviation = np.sqrt(variance)
@@ -247,7 +249,9 @@ def sweep(image, others, turns, shifts, pixels, inverse_depths, half):
                     each[seen] = likeness / deviation
                     seen += 1
             scores[d] = _mean_of_better_half(each, seen) if seen else -1.0
-        top = int(np.argmax(scores))
+        top = 0
+        for d in range(1, n_depths):
+            top = d if scores[d] > scores[top] else top
         if top == 0 or top == n_depths - 1 or scores[top] <= -1.0:
             continue
         best[p] = scores[top]
@@ -310,4 +314,7 @@ def _mean_of_better_half(values, count):
             values[k] = values[k - 1]
             k -= 1
         values[k] = held
-    return np.mean(values[count // 2 if count > 2 else 0 : count])
+    first, total = count // 2 if count > 2 else 0, 0.0
+    for i in range(first, count):
+        total += values[i]
+    return total / (count - first)

@@ -15,6 +15,7 @@ from morph_dslam.model.reduced_model import spread_over, triangle_normals
 from morph_dslam.registration.increments import moved_similarity
 from morph_dslam.registration.registration import Axis
 from morph_dslam.registration.scene import MapPoints
+from morph_dslam.small_arrays import cholesky_solve
 
 Array = NDArray[np.float64]
 #: Points spread over the surface.
@@ -260,7 +261,7 @@ def normal_equations(positions, samples, normals, nearest, rotation, middle, sca
             row[1] = arm[1] * d[2] - arm[2] * d[1]
             row[2] = arm[2] * d[0] - arm[0] * d[2]
             row[3] = arm[0] * d[1] - arm[1] * d[0]
-            row[4:] = d
+            row[4], row[5], row[6] = d[0], d[1], d[2]
             measured = along if to_planes else gap[direction]
             for i in range(7):
                 right[i] += weights[p] * row[i] * measured
@@ -295,8 +296,9 @@ def damped_step(matrix, right, prior):
             damped[i, :], damped[:, i], aim[i], damped[i, i] = 0.0, 0.0, 0.0, 1.0
         else:
             damped[i, i] += prior[i]
-    step = np.linalg.solve(damped, aim)
-    step[:4] = np.clip(step[:4], -0.3, 0.3)
+    step = cholesky_solve(damped, aim)
+    for i in range(4):
+        step[i] = min(max(step[i], -0.3), 0.3)
     return step
 
 

@@ -17,11 +17,12 @@ from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.model.reduced_model import triangle_normals
 from morph_dslam.render.rasteriser import draw_depth
+from morph_dslam.small_arrays import dot
 
 Array = NDArray[np.float64]
 #: Cosine of the angle between two triangles from which their edge is seen, points along the edges of the size of the
 #: object, and the factor by which depth is drawn smaller.
-SHARP, SPACING, SHRINK = 0.85, 80, 2
+SHARP, SPACING, SHRINK = 0.85, 80, 2.0
 #: The same cosine, from which on the two triangles lie in one plane.
 FLAT = 1.0 - 1e-9
 #: Surfaces of more triangles than this are drawn with so many. A scan of 56 000 and a seal of 29 000 triangles then
@@ -145,7 +146,7 @@ class MeshEdges:
     def depth(self, pose: RigidTransform, camera: Camera, shrink: int = 1) -> Array:
         """The object's depth in every pixel of a camera with so many times fewer of them; inf beside it."""
         whole = np.full((camera.height // shrink, camera.width // shrink), np.inf)
-        drawn, left, top = drawn_depth(self.arrays, *seen_from(pose, camera), shrink)
+        drawn, left, top = drawn_depth(self.arrays, *seen_from(pose, camera), float(shrink))
         whole[top : top + drawn.shape[0], left : left + drawn.shape[1]] = drawn
         return whole
 
@@ -154,12 +155,6 @@ def seen_from(pose: RigidTransform, camera: Camera) -> tuple[Array, Array, Array
     """What compiled loops need of a view: camera_from_object's rotation and translation, the camera and its size."""
     turn = np.ascontiguousarray(pose.rotation)
     return turn, np.ascontiguousarray(pose.translation), camera.intrinsics, camera.width, camera.height
-
-
-@njit(cache=True, nogil=True)
-def dot(a, b):
-    """Scalar product of two vectors (3,), without a call of the linear algebra."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True, nogil=True)

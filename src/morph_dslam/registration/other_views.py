@@ -14,9 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.registration.mesh_edges import dot, move_point, turn_vector
+from morph_dslam.registration.mesh_edges import move_point, turn_vector
 from morph_dslam.registration.scene import View
 from morph_dslam.registration.view_search import HALF, N_DIRECTIONS, N_PARTS, PER_GAIN, InView, edge_gains
+from morph_dslam.small_arrays import dot
 from morph_dslam.threads import on_all_cores
 
 Array = NDArray[np.float64]

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.registration.registration import Axis
+from morph_dslam.small_arrays import cross
 
 Array = NDArray[np.float64]
 #: A plane holds at least this part of the map; at most so many are taken out.
@@ -62,17 +63,17 @@ def fullest_plane(points, triples, thickness):
     normal, offset, most = np.zeros(3), 0.0, 0
     for t in range(len(triples)):
         a, b, c = points[triples[t, 0]], points[triples[t, 1]], points[triples[t, 2]]
-        across = np.cross(b - a, c - a)
-        length = np.sqrt(np.sum(across**2))
+        x, y, z = cross(b - a, c - a)
+        length, count = np.sqrt(x**2 + y**2 + z**2), 0
         if length == 0.0:
             continue
-        across, count = across / length, 0
-        away = across[0] * a[0] + across[1] * a[1] + across[2] * a[2]
+        x, y, z = x / length, y / length, z / length
+        away = x * a[0] + y * a[1] + z * a[2]
         for p in range(len(points)):
-            here = across[0] * points[p, 0] + across[1] * points[p, 1] + across[2] * points[p, 2]
+            here = x * points[p, 0] + y * points[p, 1] + z * points[p, 2]
             count += abs(here - away) <= thickness
         if count > most:
-            normal, offset, most = across, away, count
+            normal[0], normal[1], normal[2], offset, most = x, y, z, away, count
     return normal, offset
 
 

@@ -365,8 +365,9 @@ def carry(triangle_ids, weights, triangles, coordinates, depths, depth, image, c
             x0, y0 = int(np.floor(x)), int(np.floor(y))
             if x0 < 1 or y0 < 1 or x0 + 2 >= width or y0 + 2 >= height:
                 continue
-            around = depth[y0 : y0 + 2, x0 : x0 + 2]
-            if z > around.min() * (1.0 + HIDDEN_BY) or z < around.max() * (1.0 - HIDDEN_BY):
+            near = min(depth[y0, x0], depth[y0, x0 + 1], depth[y0 + 1, x0], depth[y0 + 1, x0 + 1])
+            far = max(depth[y0, x0], depth[y0, x0 + 1], depth[y0 + 1, x0], depth[y0 + 1, x0 + 1])
+            if z > near * (1.0 + HIDDEN_BY) or z < far * (1.0 - HIDDEN_BY):
                 continue
             carried[row, column] = _sample(image, x, y, across, along)
             shown[row, column] = True
@@ -396,7 +397,9 @@ def _sample_patch(image, xs, ys, x, y, count, lines, seen):
     All pixels are displaced by the same part of a pixel: the rows are interpolated once, into the scratch ``lines``.
     """
     height, width = image.shape
-    left, right, top, bottom = xs[:count].min(), xs[:count].max(), ys[0], ys[count - 1]
+    left, right, top, bottom = xs[0], xs[0], ys[0], ys[count - 1]
+    for i in range(1, count):
+        left, right = min(left, xs[i]), max(right, xs[i])
     if left + x < 1.0 or top + y < 1.0 or right + x >= width - 2 or bottom + y >= height - 2:
         return False
     x0, y0, wide = int(np.floor(x)), int(np.floor(y)), right - left + 1
@@ -434,8 +437,10 @@ def _align(image, xs, ys, values, slopes, count, lines, seen):
     for _ in range(ITERATIONS):
         if not _sample_patch(image, xs, ys, x, y, count, lines, seen):
             break
-        mean = seen[:count].mean()
-        both = own = 0.0
+        mean = both = own = 0.0
+        for i in range(count):
+            mean += seen[i]
+        mean /= count
         for i in range(count):
             both += values[i] * (seen[i] - mean)
             own += (seen[i] - mean) ** 2
@@ -483,8 +488,12 @@ def align_patches(carried, shown, image, centres, half):
         count = _patch(carried, shown, column, row, half, xs, ys, values, slopes)
         if count < LEAST_SHARE * side:
             continue
-        values[:count] -= values[:count].mean()
-        slopes[:count, 0] -= slopes[:count, 0].mean()
-        slopes[:count, 1] -= slopes[:count, 1].mean()
+        mean = mean_x = mean_y = 0.0
+        for i in range(count):
+            mean, mean_x, mean_y = mean + values[i], mean_x + slopes[i, 0], mean_y + slopes[i, 1]
+        for i in range(count):
+            values[i] -= mean / count
+            slopes[i, 0] -= mean_x / count
+            slopes[i, 1] -= mean_y / count
         moves[p, 0], moves[p, 1], alike[p] = _align(image, xs, ys, values, slopes, count, lines, seen)
     return moves, alike

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.model import SurfacePoints
+from morph_dslam.small_arrays import cross, dot
 
 Array = NDArray[np.float64]
 #: Barycentric slack, so that a ray through a shared edge meets at least one of its triangles.
@@ -78,16 +79,6 @@ def _cells_between(a, b, c, corner, size):
 
 
 @njit(cache=True, nogil=True)
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@njit(cache=True, nogil=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True, nogil=True)
 def _nearest(nodes, triangles, rays, order, starts, corner, size):
     found, nearest = np.full(len(rays), -1, dtype=np.int64), np.zeros(len(rays))
     weights = np.full((len(rays), 3), np.nan)
@@ -96,7 +87,7 @@ def _nearest(nodes, triangles, rays, order, starts, corner, size):
         a = (nodes[i, 0], nodes[i, 1], nodes[i, 2])
         b = (nodes[j, 0], nodes[j, 1], nodes[j, 2])
         c = (nodes[k, 0], nodes[k, 1], nodes[k, 2])
-        volume = _dot(a, _cross(b, c))
+        volume = dot(a, cross(b, c))
         if not (a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0) or volume == 0.0:  # behind, or seen edge-on
             continue
         left, right = _cells_between(a[0] / a[2], b[0] / b[2], c[0] / c[2], corner[0], size[0])
@@ -105,9 +96,9 @@ def _nearest(nodes, triangles, rays, order, starts, corner, size):
             for place in range(starts[row * GRID + left], starts[row * GRID + right + 1]):
                 ray = order[place]
                 d = (rays[ray, 0], rays[ray, 1], rays[ray, 2])
-                of_a = _dot(d, _cross(b, c)) / volume
-                of_b = _dot(d, _cross(c, a)) / volume
-                of_c = _dot(d, _cross(a, b)) / volume
+                of_a = dot(d, cross(b, c)) / volume
+                of_b = dot(d, cross(c, a)) / volume
+                of_c = dot(d, cross(a, b)) / volume
                 # 1 / (the multiple of the ray at which it meets the plane)
                 inverse_range = of_a + of_b + of_c
                 if inverse_range <= nearest[ray]:

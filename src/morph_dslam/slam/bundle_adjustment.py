@@ -3,7 +3,7 @@
 Levenberg-Marquardt on the Huber cost of reprojection errors; points are eliminated by the Schur complement (Triggs et
 al., Bundle Adjustment - A Modern Synthesis, 2000, section 6). Where a camera measures depth, the column of the point in
 a right image at a known baseline is a third residual (Mur-Artal and Tardós, ORB-SLAM2, 2017). No interpreter lock is
-held. numba's `np.linalg` takes many seconds to compile; the linear algebra here takes one, and runs as fast.
+held.
 """
 
 from __future__ import annotations
@@ -15,36 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.geometry import rotation_exp
-
-#: Pivots are kept above this part of their diagonal entry, so that a singular system still gives a step.
-LEAST_PIVOT = 1e-14
-
-
-@njit(cache=True, nogil=True)
-def cholesky_solve(matrix, right):
-    """The solution (n,) of a symmetric positive definite system; reads the lower half of ``matrix``."""
-    n = len(right)
-    factor, solution = np.zeros((n, n)), np.empty(n)
-    for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= factor[i, k] * factor[j, k]
-            if i == j:
-                factor[i, i] = np.sqrt(max(value, LEAST_PIVOT * abs(matrix[i, i]) + 1e-300))
-            else:
-                factor[i, j] = value / factor[j, j]
-    for i in range(n):
-        value = right[i]
-        for k in range(i):
-            value -= factor[i, k] * solution[k]
-        solution[i] = value / factor[i, i]
-    for i in range(n - 1, -1, -1):
-        value = solution[i]
-        for k in range(i + 1, n):
-            value -= factor[k, i] * solution[k]
-        solution[i] = value / factor[i, i]
-    return solution
+from morph_dslam.small_arrays import cholesky_solve
 
 
 @njit(cache=True, nogil=True)

@@ -17,11 +17,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.row_products import FAST
-from morph_dslam.slam.bundle_adjustment import cholesky_solve
 from morph_dslam.slam.pose import inverse
 from morph_dslam.slam.result import SlamFrame
 from morph_dslam.slam.rigid_map import GOOD, Followed, Indices, RigidMap
 from morph_dslam.slam.templates import change_of_view
+from morph_dslam.small_arrays import cholesky_solve
 from morph_dslam.tracking.patches import NEUTRAL
 
 Array = NDArray[np.float64]

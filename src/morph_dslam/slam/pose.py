@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.slam.bundle_adjustment import (
     LEAST_DEPTH,
-    cholesky_solve,
     huber,
     in_camera,
     jacobians,
@@ -27,6 +26,7 @@ from morph_dslam.slam.bundle_adjustment import (
     residual,
     turned_and_shifted,
 )
+from morph_dslam.small_arrays import cholesky_solve, median
 
 Array = NDArray[np.float64]
 
@@ -180,9 +180,14 @@ def _refine_in_rounds(pose, points, pixels, camera, huber_px, inlier_px, used):
         pose, matrix = _refine(pose, points, pixels, camera, huber_px, used, 10)
         make_orthonormal(pose)
         errors = _errors(pose, points, pixels, camera)
-        inliers = errors[errors < inlier_px]
-        core_px = min(inlier_px, max(CORE_RATIO * np.median(inliers), LEAST_CORE_PX)) if len(inliers) else 0.0
-        used = errors < core_px
+        inliers, count, used = np.empty(len(errors)), 0, np.empty(len(errors), np.bool_)
+        for i in range(len(errors)):
+            if errors[i] < inlier_px:
+                inliers[count] = errors[i]
+                count += 1
+        core_px = min(inlier_px, max(CORE_RATIO * median(inliers[:count]), LEAST_CORE_PX)) if count else 0.0
+        for i in range(len(errors)):
+            used[i] = errors[i] < core_px
     square, n = 0.0, 0
     for error in errors:
         if error < inlier_px:

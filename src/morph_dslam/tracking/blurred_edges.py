@@ -187,7 +187,8 @@ def _linearized(kind, place, width, blur, blurs, basis, left, of_blur):
             of_blur[i] += products[k] * bends[k, i] * blur  # a Gaussian spreads as heat does
     wide = 0.0
     if kind == NARROW:
-        basis[count] = (products[1] - products[2]) * of_width
+        for i in range(n):
+            basis[count, i] = (products[1] - products[2]) * of_width[i]
         wide = _normalized(basis, count, products)
     size = _normalized(basis, last, products)
     return wide, size, products[count]
@@ -199,7 +200,8 @@ def _normalized(basis, row, products):
     length = _leave(basis, row, basis[row], products)
     if not length > 0.0:
         return 0.0
-    basis[row] /= length
+    for i in range(basis.shape[1]):
+        basis[row, i] /= length
     return length
 
 
@@ -224,7 +226,8 @@ def fit_edge(kind, values, place, width, blur, read):
     basis, left, of_blur, products = np.empty((rows, n)), np.empty(n), np.empty(n), np.empty(rows)
     gradient, size, rest, blurs = 0.0, 0.0, 0.0, np.sqrt(blur * blur + read)
     for _ in range(N_STEPS[kind] if n > rows else 0):
-        left[:] = values
+        for i in range(n):
+            left[i] = values[i]
         wide, size, shared = _linearized(kind, place, width, blur, blurs, basis, left, of_blur)
         if not size > 0.0 or (kind == NARROW and not wide > 0.0):
             return np.nan, np.nan, 0.0, 0.0

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.model import SurfacePoints
+from morph_dslam.small_arrays import cross, dot
 
 Array = NDArray[np.float64]
 #: Pixels between candidates along the contour, and the least distance from the image's border.
@@ -109,7 +110,9 @@ def find_contour(
     occluder_depth : (h, w) of other objects, infinite where there are none.
     """
     occluders = np.empty((0, 0), dtype=np.float32) if occluder_depth is None else occluder_depth
-    rows, shares, places, normals, turns_away = _candidates(edges.nodes, nodes, pixels, depth, occluders, focal, size)
+    found = _candidates(edges.nodes, nodes, pixels, depth, occluders, focal, size)
+    rows, shares, turns_away = found[:, 0].astype(np.int64), found[:, 1], found[:, 6] > 0.0
+    places, normals = np.ascontiguousarray(found[:, 2:4]), np.ascontiguousarray(found[:, 4:6])
     chosen = _spread(places, normals, len(rows) / max(count, 1), count)
     rows, shares = rows[chosen], shares[chosen]
     weights = np.zeros((len(rows), 3))
@@ -156,9 +159,9 @@ def _normal(edge, nodes, nx, ny):
     if edge[3] < 0:
         return nx, ny, False
     a, b = nodes[edge[0]], nodes[edge[1]]
-    first, second = np.cross(b - a, nodes[edge[2]] - a), np.cross(a - b, nodes[edge[3]] - b)
-    sizes = np.sqrt(np.dot(first, first)), np.sqrt(np.dot(second, second))
-    if not min(sizes) > 0.0 or np.dot(first, second) < SMOOTH * sizes[0] * sizes[1]:
+    first, second = cross(b - a, nodes[edge[2]] - a), cross(a - b, nodes[edge[3]] - b)
+    sizes = np.sqrt(dot(first, first)), np.sqrt(dot(second, second))
+    if not min(sizes) > 0.0 or dot(first, second) < SMOOTH * sizes[0] * sizes[1]:
         return nx, ny, False
     x, y = first[0] / sizes[0] + second[0] / sizes[1], first[1] / sizes[0] + second[1] / sizes[1]
     along, length = x * nx + y * ny, np.hypot(x, y)
@@ -189,16 +192,12 @@ def _is_seen(x, y, nx, ny, z, jump, depth, occluders):
 
 @njit(cache=True, nogil=True)
 def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
-    """Edges (k,), shares of their length (k,), pixels (k, 2) and outward normals (k, 2) of what is seen of the contour,
-    and whether the surface is smooth (k,) there.
+    """What is seen of the contour (k, 7): edge, share of its length, pixel (2), outward normal (2), 1 if smooth there.
 
     Every `STEP_PX` pixels along the edges, one after the other.
     """
     height, width = depth.shape
-    capacity, count = 4096, 0
-    rows, shares = np.empty(capacity, np.int64), np.empty(capacity)
-    places, normals, smooth = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity, np.bool_)
-    left = 0.5 * STEP_PX
+    found, count, left = np.empty((4096, 7)), 0, 0.5 * STEP_PX
     for e in range(len(edges)):
         start, end = edges[e, 0], edges[e, 1]
         side = _side(pixels, start, end, edges[e, 2])
@@ -222,21 +221,17 @@ def _candidates(edges, nodes, pixels, depth, occluders, focal, size):
             z = 1.0 / (first + last)
             if not _is_seen(x, y, nx, ny, z, max(JUMP_SHARE * size, JUMP_PX * z / focal), depth, occluders):
                 continue
-            if count == capacity:
-                capacity *= 2
-                rows, shares = np.append(rows, np.empty(count, np.int64)), np.append(shares, np.empty(count))
-                places, normals = (
-                    np.concatenate((places, np.empty((count, 2)))),
-                    np.concatenate((normals, np.empty((count, 2)))),
-                )
-                smooth = np.append(smooth, np.empty(count, np.bool_))
-            rows[count], shares[count] = e, last * z
-            places[count, 0], places[count, 1] = x, y
-            normals[count, 0], normals[count, 1] = nx, ny
-            smooth[count] = is_smooth
+            if count == len(found):
+                longer = np.empty((2 * count, 7))
+                for row in range(count):
+                    for k in range(7):
+                        longer[row, k] = found[row, k]
+                found = longer
+            found[count, 0], found[count, 1], found[count, 2], found[count, 3] = e, last * z, x, y
+            found[count, 4], found[count, 5], found[count, 6] = nx, ny, is_smooth
             count += 1
         left = along - length
-    return rows[:count], shares[:count], places[:count], normals[:count], smooth[:count]
+    return found[:count]
 
 
 @njit(cache=True, nogil=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.even_rows import evenly
 from morph_dslam.row_products import FAST
+from morph_dslam.small_arrays import median, scaled
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
@@ -189,34 +190,46 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     freedom = count - size
     if freedom <= 0:
         return np.inf, np.full((size, size), np.inf)
-    length, is_pair = np.empty(len(numbers)), numbers == 2
+    lengths, pairs, n_pairs = np.empty(len(numbers)), np.empty(len(numbers)), 0
     psi_squared, slopes, factors = 0.0, 0.0, 0.0
     for j in range(len(numbers)):
-        length[j] = np.hypot(residuals[j, 0], residuals[j, 1])
-        factor = min(1.0, huber_px / max(length[j], 1e-300))
-        psi_squared += weights[j] * (factor * length[j]) ** 2
-        slopes += 0.5 * (factor + (1.0 if length[j] <= huber_px else 0.0))
+        length = np.hypot(residuals[j, 0], residuals[j, 1])
+        factor = min(1.0, huber_px / max(length, 1e-300))
+        psi_squared += weights[j] * (factor * length) ** 2
+        slopes += 0.5 * (factor + (1.0 if length <= huber_px else 0.0))
         factors += factor
+        lengths[j] = np.sqrt(weights[j]) * length
+        if numbers[j] == 2:
+            pairs[n_pairs] = lengths[j]
+            n_pairs += 1
     # The length of a Gaussian pair has the median 1.1774 sigma (Rayleigh), that of a number 0.6745 sigma.
-    if is_pair.any():
-        sigma = np.median((np.sqrt(weights) * length)[is_pair]) / 1.1774 * np.sqrt(count / freedom)
-    else:
-        sigma = np.median(np.sqrt(weights) * length) / 0.6745 * np.sqrt(count / freedom)
+    sigma = median(pairs[:n_pairs]) / 1.1774 if n_pairs else median(lengths) / 0.6745
+    sigma *= np.sqrt(count / freedom)
     mean_slope = max(slopes / len(numbers), 1e-3)
     variance = max(psi_squared / freedom * (factors / len(numbers)) / mean_slope**2, LEAST_SPREAD_PX**2)
-    sizes = np.outer(scale, scale)
-    return max(sigma, LEAST_SPREAD_PX), variance * floored_inverse(hessian * sizes) * sizes
+    inverse = floored_inverse(scaled(hessian, scale))
+    for a in range(size):
+        for b in range(size):
+            inverse[a, b] *= variance
+    return max(sigma, LEAST_SPREAD_PX), scaled(inverse, scale)
 
 
 @njit(cache=True, nogil=True)
 def floored_inverse(hessian):
     """Inverse of a Hessian (k, k), no eigenvalue of which counts as less than `EIGENVALUE_FLOOR` of the largest."""
-    inverse = _definite_inverse(hessian)
+    inverse, n, of_hessian, of_inverse = _definite_inverse(hessian), len(hessian), 0.0, 0.0
+    for k in range(len(inverse)):
+        of_hessian, of_inverse = of_hessian + hessian[k, k], of_inverse + inverse[k, k]
     # The traces are no less than the largest eigenvalue, and one over the least.
-    if len(inverse) == len(hessian) and np.trace(hessian) * np.trace(inverse) * EIGENVALUE_FLOOR < 1.0:
+    if len(inverse) == n and of_hessian * of_inverse * EIGENVALUE_FLOOR < 1.0:
         return inverse
     values, vectors = np.linalg.eigh(hessian)
-    return (vectors / np.maximum(values, max(values[-1], 1e-30) * EIGENVALUE_FLOOR)) @ vectors.T
+    inverse, floor = np.zeros((n, n)), max(values[-1], 1e-30) * EIGENVALUE_FLOOR
+    for a in range(n):
+        for b in range(n):
+            for k in range(n):
+                inverse[a, b] += vectors[a, k] / max(values[k], floor) * vectors[b, k]
+    return inverse
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -262,11 +275,11 @@ def trace_of_share(whole, part, scale):
     whole, part : (n, n), H and P.
     scale : (n,) of the unknowns, which makes them comparable.
     """
-    sizes = np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(whole * sizes)
-    part, trace = part * sizes, 0.0
+    values, vectors = np.linalg.eigh(scaled(whole, scale))
+    part, trace = scaled(part, scale), 0.0
     for k in range(len(values)):
         if values[k] > EIGENVALUE_FLOOR * values[-1]:
-            along = np.ascontiguousarray(vectors[:, k])
-            trace += along @ part @ along / values[k]
+            for a in range(len(values)):
+                for b in range(len(values)):
+                    trace += vectors[a, k] * part[a, b] * vectors[b, k] / values[k]
     return trace

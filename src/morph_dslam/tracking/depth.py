@@ -128,7 +128,7 @@ class PointDepths:
 
     def linearised(self, points: BoundPoints, state: State) -> tuple[Array, Array]:
         """Residuals (p,) in pixels at a state, and their derivatives (p, d + 6); zero of points without depth."""
-        return weighted_depths(*points.in_state(state), self.depths, self.weights)
+        return weighted_depths(*points.in_state(state), np.ascontiguousarray(self.depths), self.weights)
 
 
 def _plane_depth(image: NDArray[np.float32], pixels: Array) -> Array:

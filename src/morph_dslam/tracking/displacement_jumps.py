@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from morph_dslam.even_rows import evenly
 from morph_dslam.model.discrepancy import farthest_points
 from morph_dslam.row_products import FAST
+from morph_dslam.small_arrays import median
 
 Array = NDArray[np.float64]
 #: Places, as many as there may be, and how far the points of one reach, as a share of the object's diagonal.
@@ -175,10 +176,10 @@ def _grown_steps(before, rows, steps, deviations, least):
             # A median is no larger than the largest, so that hardly any is needed.
             if not right**2 + down**2 > max(least, sizes[k]) ** 2 or np.isnan(np.sum(u)):
                 continue
-            middle_u, middle_v = np.median(u), np.median(v)
+            middle_u, middle_v = median(u), median(v)
             change = np.sqrt(middle_u**2 + middle_v**2)
             # The deviation of a median is 1.25 times that of a mean, and the median distance 1.18 deviations.
-            spread = np.median(np.sqrt((u - middle_u) ** 2 + (v - middle_v) ** 2)) * 1.25 / 1.18 / np.sqrt(count)
+            spread = median(np.sqrt((u - middle_u) ** 2 + (v - middle_v) ** 2)) * 1.25 / 1.18 / np.sqrt(count)
             clear = change > LEAST_DEVIATIONS * np.sqrt(deviations[k, d] ** 2 + spread**2)
             if clear and change > max(least, sizes[k]):
                 sizes[k] = change
@@ -214,21 +215,24 @@ def _fit_steps(rows, first, plane, values, usable, directions, least):
     are too few points. Each is from the least squares fit of a plane and a step; what the plane takes of the step's
     own pattern is taken from that first (Frisch and Waugh, Econometrica 1, 1933). A step is no larger than the values
     differ: where there are no points near the line, as between the folds of a bellows, it would be extrapolated."""
-    count, most = len(first) - 1, np.max(np.diff(first))
+    count, most = len(first) - 1, 0
+    for k in range(count):
+        most = max(most, first[k + 1] - first[k])
     steps, deviations = np.full((count, directions, 2), np.nan), np.full((count, directions), np.nan)
     # By rows: ones and the place's two coordinates, made orthonormal, then the two values, less what these explain.
     work, sides = np.empty((5, most)), np.empty(most)
     for k in range(count):
-        n = 0
+        n, least_u, least_v, most_u, most_v = 0, np.inf, np.inf, -np.inf, -np.inf
         for m in range(first[k], first[k + 1]):
             if usable[rows[m]]:
-                work[0, n], work[1, n], work[2, n] = 1.0, plane[m, 0], plane[m, 1]
-                work[3, n], work[4, n] = values[rows[m], 0], values[rows[m], 1]
+                u, v = values[rows[m], 0], values[rows[m], 1]
+                work[0, n], work[1, n], work[2, n], work[3, n], work[4, n] = 1.0, plane[m, 0], plane[m, 1], u, v
+                least_u, least_v, most_u, most_v = min(least_u, u), min(least_v, v), max(most_u, u), max(most_v, v)
                 n += 1
         if n < 2 * least + 2:
             continue
         right, down = work[1, :n].copy(), work[2, :n].copy()
-        most_u, most_v = np.ptp(work[3, :n]), np.ptp(work[4, :n])
+        most_u, most_v = most_u - least_u, most_v - least_v
         for row in range(5):
             _take_from(work, n, row)
         squares = _product(work[3], work[3], n) + _product(work[4], work[4], n)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import ReducedModel
+from morph_dslam.small_arrays import cholesky_solve, scaled
 from morph_dslam.tracking.state import State
 
 Array = NDArray[np.float64]
@@ -46,14 +47,19 @@ def bounded_step(hessian, gradient, lower, upper):
         target, leaves = _minimiser_of_free(hessian, gradient, step, free), False
         for k in range(n):
             step[k] = min(max(target[k], lower[k]), upper[k])
-            if step[k] != target[k]:
+            if free[k] and step[k] != target[k]:
                 free[k], leaves = False, True
     # Each bound is left a few times at most: the limit only guards against rounding.
     for _ in range(4 * n + 4):
-        slope = gradient + hessian @ step
-        gain, best = 1e-14 * abs(gradient @ step), -1
+        gained, best = 0.0, -1
         for k in range(n):
-            inwards = -slope[k] if step[k] <= lower[k] else slope[k]
+            gained += gradient[k] * step[k]
+        gain = 1e-14 * abs(gained)
+        for k in range(n):
+            slope = gradient[k]
+            for other in range(n):
+                slope += hessian[k, other] * step[other]
+            inwards = -slope if step[k] <= lower[k] else slope
             if not free[k] and lower[k] < upper[k] and inwards**2 / hessian[k, k] > gain and inwards > 0.0:
                 gain, best = inwards**2 / hessian[k, k], k
         if best < 0:
@@ -80,20 +86,23 @@ def bounded_step(hessian, gradient, lower, upper):
 @njit(cache=True, nogil=True)
 def _minimiser_of_free(hessian, gradient, step, free):
     """The step (n,) whose free unknowns minimise the quadratic model, the others as they are."""
-    rows = np.flatnonzero(free)
-    matrix, right = np.empty((len(rows), len(rows))), np.empty(len(rows))
-    for a in range(len(rows)):
+    n, count = len(gradient), 0
+    rows = np.empty(n, np.int64)
+    for k in range(n):
+        if free[k]:
+            rows[count] = k
+            count += 1
+    matrix, right = np.empty((count, count)), np.empty(count)
+    for a in range(count):
         right[a] = -gradient[rows[a]]
-        for k in range(len(gradient)):
+        for k in range(n):
             if not free[k]:
                 right[a] -= hessian[rows[a], k] * step[k]
-        for b in range(len(rows)):
+        for b in range(count):
             matrix[a, b] = hessian[rows[a], rows[b]]
-    target = step.copy()
-    if len(rows) > 0:
-        found = np.linalg.solve(matrix, right)
-        for a in range(len(rows)):
-            target[rows[a]] = found[a]
+    target, found = step.copy(), cholesky_solve(matrix, right)
+    for a in range(count):
+        target[rows[a]] = found[a]
     return target
 
 
@@ -219,20 +228,23 @@ def damped_step(hessian, gradient, parameters, lowest, highest, scale, damping):
     damping : relative to the diagonal.
     """
     n, d = len(gradient), len(parameters)
-    scaled, slope = np.empty((n, n)), gradient * scale
+    whole, slope, largest = scaled(hessian, scale), np.empty(n), -np.inf
+    damped, lower, upper = whole.copy(), np.empty(n), np.empty(n)
     for a in range(n):
+        slope[a], largest = gradient[a] * scale[a], max(largest, whole[a, a])
+    floor = max(largest * DAMPING_FLOOR, 1e-30)
+    for a in range(n):
+        damped[a, a] += damping * max(whole[a, a], floor) + 1e-3 * floor
+        lower[a], upper[a] = -LARGEST_STEP, LARGEST_STEP
+        if a < d:
+            lower[a] = max(lower[a], (lowest[a] - parameters[a]) / scale[a])
+            upper[a] = min(upper[a], (highest[a] - parameters[a]) / scale[a])
+    step, change = bounded_step(damped, slope, lower, upper), 0.0
+    for a in range(n):
+        change += slope[a] * step[a]
         for b in range(n):
-            scaled[a, b] = hessian[a, b] * scale[a] * scale[b]
-    damped = scaled.copy()
-    floor = max(np.diag(scaled).max() * DAMPING_FLOOR, 1e-30)
-    for a in range(n):
-        damped[a, a] += damping * max(scaled[a, a], floor) + 1e-3 * floor
-    lower, upper = np.full(n, -LARGEST_STEP), np.full(n, LARGEST_STEP)
-    for k in range(d):
-        lower[k] = max(lower[k], (lowest[k] - parameters[k]) / scale[k])
-        upper[k] = min(upper[k], (highest[k] - parameters[k]) / scale[k])
-    step = bounded_step(damped, slope, lower, upper)
-    return step, -(slope @ step + 0.5 * step @ (scaled @ step))
+            change += 0.5 * step[a] * whole[a, b] * step[b]
+    return step, -change
 
 
 @njit(cache=True, nogil=True)
@@ -250,7 +262,15 @@ def damped_trial(hessian, gradient, parameters, rotation, translation, lowest, h
     parameters, rotation, translation : of the state, as above.
     """
     step, predicted = damped_step(hessian, gradient, parameters, lowest, highest, scale, damping)
-    step, d = step * scale, len(parameters)
-    # Rounding may leave a parameter an ulp outside its range.
-    there = np.minimum(np.maximum(parameters + step[:d], lowest), highest)
-    return predicted, there, rotation_exp(step[d : d + 3]) @ rotation, translation + step[d + 3 :]
+    d, turned, shifted = len(parameters), np.zeros((3, 3)), np.empty(3)
+    for k in range(len(step)):
+        step[k] *= scale[k]
+    there, turn = np.empty(d), rotation_exp(step[d : d + 3])
+    for k in range(d):  # rounding may leave a parameter an ulp outside its range
+        there[k] = min(max(parameters[k] + step[k], lowest[k]), highest[k])
+    for i in range(3):
+        shifted[i] = translation[i] + step[d + 3 + i]
+        for j in range(3):
+            for k in range(3):
+                turned[i, j] += turn[i, k] * rotation[k, j]
+    return predicted, there, turned, shifted

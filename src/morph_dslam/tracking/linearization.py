@@ -35,7 +35,8 @@ class Linearization:
     @classmethod
     def of(cls, jacobian: Array, residuals: Array, weights: Array, huber_px: float) -> Linearization:
         """Of the Jacobian (p, 2, d + 6) of all points, their residuals (p, 2), pixels, and their weights (p,)."""
-        return cls(*_counting(jacobian, np.ascontiguousarray(residuals), weights, huber_px))
+        numbers = np.asarray(weights, dtype=np.float64)
+        return cls(*_counting(jacobian, np.ascontiguousarray(residuals), numbers, huber_px))
 
     @property
     def hessian(self) -> Array:
@@ -73,7 +74,12 @@ def _counting(jacobian, residuals, weights, huber):
         if weights[j] > 0.0 and np.isfinite(length + np.sum(jacobian[j])):
             usable[j] = True
             weight = weights[j] * min(1.0, huber / max(length, 1e-300))
-            left[j], seen[j], weighted[j], counted[j] = residuals[j], jacobian[j], weight * jacobian[j], weight
+            counted[j] = weight
+            # Entry by entry: numba takes seconds to compile the assignment of one array to a part of another.
+            for c in range(2):
+                left[j, c] = residuals[j, c]
+                for k in range(jacobian.shape[2]):
+                    seen[j, c, k], weighted[j, c, k] = jacobian[j, c, k], weight * jacobian[j, c, k]
     return usable, left, seen, weighted, counted
 
 

@@ -51,7 +51,7 @@ def blurred_paths(
     if not LARGEST_SHARE * way > LEAST_PATH_PX:
         return None
     rows = slice(None, None, 1 + (len(ways) - 1) // MOST_ASKED)
-    asked = places[rows], found[rows], ways[rows]
+    asked = [np.ascontiguousarray(each[rows]) for each in (places, found, ways)]  # of one layout, compiled once
     along = left_different(rendered, frame, *asked)
     share = LARGEST_SHARE * int(np.argmin(along)) / N_STEPS
     if not (along.min() < CLEARLY_LESS * along[0] and share * way > LEAST_PATH_PX):

@@ -89,7 +89,8 @@ def block_diagonal(blocks: Sequence[scipy.sparse.csr_array]) -> scipy.sparse.csr
     values = np.concatenate([block.data for block in blocks])
     columns = np.concatenate([block.indices + first for block, first in zip(blocks, rows, strict=False)])
     begins = np.concatenate([[0], *(block.indptr[1:] + first for block, first in zip(blocks, entries, strict=False))])
-    return scipy.sparse.csr_array((values, columns, begins), shape=(rows[-1], rows[-1]))
+    indices = columns.astype(np.int32), begins.astype(np.int32)  # as those of one block, for `_sparse_quadratic`
+    return scipy.sparse.csr_array((values, *indices), shape=(rows[-1], rows[-1]))
 
 
 def window_correlation(pixels: Array, window: int) -> scipy.sparse.csr_array:
@@ -99,15 +100,22 @@ def window_correlation(pixels: Array, window: int) -> scipy.sparse.csr_array:
     """
     if not len(pixels):
         return scipy.sparse.csr_array((0, 0))
-    return scipy.sparse.csr_array(_overlaps(pixels, float(window)), shape=(len(pixels), len(pixels)))
+    from_left = np.argsort(np.where(np.isfinite(pixels[:, 0]), pixels[:, 0], np.inf), kind="stable")
+    overlaps = _overlaps(pixels[from_left], from_left, float(window))
+    return scipy.sparse.csr_array(overlaps, shape=(len(pixels), len(pixels)))
 
 
 @njit(cache=True, nogil=True)
-def _overlaps(pixels, window):
-    """Values, columns and beginnings of the rows of the sparse matrix of shared windows."""
-    count = len(pixels)
-    from_left = np.argsort(np.where(np.isfinite(pixels[:, 0]), pixels[:, 0], np.inf))
-    x, y, found = pixels[from_left, 0], pixels[from_left, 1], np.ones(count, np.int32)
+def _overlaps(ordered, from_left, window):
+    """Values, columns and beginnings of the rows of the sparse matrix of shared windows.
+
+    Parameters
+    ----------
+    ordered, from_left : the pixels (p, 2) in order of their columns, and which (p,) these are.
+    window : side of the square that is compared around each, pixels.
+    """
+    count = len(ordered)
+    x, y, found = ordered[:, 0], ordered[:, 1], np.ones(count, np.int32)
     for a in range(count):
         b = a + 1
         while b < count and x[b] < x[a] + window:
@@ -116,9 +124,11 @@ def _overlaps(pixels, window):
                 found[from_left[b]] += 1
             b += 1
     begins = np.zeros(count + 1, np.int32)
-    begins[1:] = np.cumsum(found)
-    values, columns, ends = np.ones(begins[-1]), np.empty(begins[-1], np.int32), begins[:-1] + 1
-    columns[begins[:-1]] = np.arange(count)
+    for i in range(count):
+        begins[i + 1] = begins[i] + found[i]
+    values, columns, ends = np.ones(begins[-1]), np.empty(begins[-1], np.int32), np.empty(count, np.int32)
+    for i in range(count):
+        columns[begins[i]], ends[i] = i, begins[i] + 1
     for a in range(count):
         i, b = from_left[a], a + 1
         while b < count and x[b] < x[a] + window:

@@ -391,7 +391,7 @@ def strongest_corners(
         first, end = max(top - 2, 0), min(top + BAND, height)
         band = cv2.cornerMinEigenVal(image[first : min(end + 2, height)], 3)
         strength[top:end] = band[top - first : end - first]
-    places = _local_maxima(strength, mask, quality)[::-1]
+    places = _local_maxima(strength, np.ascontiguousarray(mask), quality)[::-1]
     order = np.argsort(-strength[places[:, 0], places[:, 1]], kind="stable")
     places = np.ascontiguousarray(places[order])
     kept = _far_apart(places, float(distance), most, *image.shape)

@@ -82,7 +82,7 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
             turned[c, j] = rotation[c, 0] * p0 + rotation[c, 1] * p1 + rotation[c, 2] * p2
         depth = turned[2, j] + translation[2]
         if depth < MINIMUM_DEPTH:
-            residuals[j] = np.nan
+            residuals[j, 0] = residuals[j, 1] = np.nan
             cost += UNSEEN_COST * weights[j]
             continue
         x, y = (turned[0, j] + translation[0]) / depth, (turned[1, j] + translation[1]) / depth
@@ -113,7 +113,12 @@ def linearise(functions, rotation, translation, rest, modes, intrinsics, pixels,
             rows[size, j], rows[size, n_points + j] = root * residuals[j, 0], root * residuals[j, 1]
     _fill_derivatives(rows, fields, slopes, turned, rotation)
     products = products_of_rows(rows)
-    return cost, np.ascontiguousarray(products[:size, :size]), products[:size, size].copy(), residuals
+    hessian, gradient = np.empty((size, size)), np.empty(size)
+    for a in range(size):
+        gradient[a] = products[a, size]
+        for b in range(size):
+            hessian[a, b] = products[a, b]
+    return cost, hessian, gradient, residuals
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -216,7 +221,8 @@ def weighted_derivatives(functions, rotation, translation, rest, modes, intrinsi
         across, down = jacobian[j, 0], jacobian[j, 1]
         length = np.sqrt(residuals[j, 0] ** 2 + residuals[j, 1] ** 2)
         if not (weights[j] > 0.0 and np.isfinite(length)):
-            across[:], down[:] = 0.0, 0.0
+            for a in range(size):
+                across[a] = down[a] = 0.0
             continue
         n0, n1 = normals[j, 0], normals[j, 1]
         factor = min(1.0, huber / max(length, 1e-300))

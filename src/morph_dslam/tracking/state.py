@@ -170,11 +170,15 @@ def _log_slope(turn):
     I - [turn]/2 + c [turn]² with c = 1/a² - 1 / (2 a tan(a/2)) (Barfoot, State Estimation for Robotics, 7.1).
     """
     angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    cross = np.zeros((3, 3))
-    cross[0, 1], cross[0, 2], cross[1, 2] = -turn[2], turn[1], -turn[0]
-    cross[1, 0], cross[2, 0], cross[2, 1] = turn[2], -turn[1], turn[0]
+    slope = np.empty((3, 3))
     c = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
-    return np.eye(3) - 0.5 * cross + c * cross @ cross
+    slope[0, 1], slope[0, 2], slope[1, 2] = 0.5 * turn[2], -0.5 * turn[1], 0.5 * turn[0]
+    slope[1, 0], slope[2, 0], slope[2, 1] = -0.5 * turn[2], 0.5 * turn[1], -0.5 * turn[0]
+    for i in range(3):  # [turn]² = turn turn' - a²
+        slope[i, i] = 1.0 - c * angle**2
+        for j in range(3):
+            slope[i, j] += c * turn[i] * turn[j]
+    return slope
 
 
 @njit(cache=True, nogil=True)
@@ -187,11 +191,29 @@ def _pose_terms(information, known_rotation, known_translation, rotation, transl
     known_rotation, known_translation : (3, 3) and (3,) of the known pose.
     rotation, translation : of the pose.
     """
-    away, slope = np.empty(6), np.eye(6)
-    away[:3], away[3:] = rotation_log(rotation @ known_rotation.T), translation - known_translation
-    slope[:3, :3] = _log_slope(away[:3])
-    push = information @ away
-    return 0.5 * (away @ push), slope.T @ information @ slope, slope.T @ push
+    apart, away, slope, push, half = np.zeros((3, 3)), np.empty(6), np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                apart[i, j] += rotation[i, k] * known_rotation[j, k]
+    turn, cost, hessian, gradient = rotation_log(apart), 0.0, np.zeros((6, 6)), np.zeros(6)
+    by_turn = _log_slope(turn)
+    for i in range(3):
+        away[i], away[3 + i], slope[3 + i, 3 + i] = turn[i], translation[i] - known_translation[i], 1.0
+        for j in range(3):
+            slope[i, j] = by_turn[i, j]
+    for i in range(6):
+        for j in range(6):
+            push[i] += information[i, j] * away[j]
+            for k in range(6):
+                half[i, j] += information[i, k] * slope[k, j]
+        cost += 0.5 * away[i] * push[i]
+    for i in range(6):
+        for j in range(6):
+            gradient[i] += slope[j, i] * push[j]
+            for k in range(6):
+                hessian[i, j] += slope[k, i] * half[k, j]
+    return cost, hessian, gradient
 
 
 @njit(cache=True, nogil=True)
@@ -201,12 +223,17 @@ def _prior_terms(
     """What `Prior.terms` returns, compiled; the arguments are those of the prior, then those of the state."""
     d = len(mean)
     hessian, gradient = np.zeros((d + 6, d + 6)), np.zeros(d + 6)
-    away = parameters - mean
-    hessian[:d, :d], gradient[:d] = information, information @ away
-    of_pose, hessian[d:, d:], gradient[d:] = _pose_terms(
-        pose_information, known_rotation, known_translation, rotation, translation
-    )
-    return 0.5 * (away @ gradient[:d]) + of_pose, hessian, gradient
+    cost, of_pose, push = _pose_terms(pose_information, known_rotation, known_translation, rotation, translation)
+    for i in range(6):
+        gradient[d + i] = push[i]
+        for j in range(6):
+            hessian[d + i, d + j] = of_pose[i, j]
+    for i in range(d):
+        for j in range(d):
+            hessian[i, j] = information[i, j]
+            gradient[i] += information[i, j] * (parameters[j] - mean[j])
+        cost += 0.5 * (parameters[i] - mean[i]) * gradient[i]
+    return cost, hessian, gradient
 
 
 #: The information of an unknown pose.
