@@ -1,6 +1,7 @@
 """What acts only while something else does: measurements of a tube that bends to an unknown side."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -17,13 +18,21 @@ from tests.support.bent_tube import AXIS, bent_tube
 from tests.support.measured_points import bound_points, measured
 
 CAMERA = Camera(640, 480, 560.0, 560.0, 320.0, 240.0)
-MODEL = with_revolution_angle(bent_tube(), AXIS)
-ESTIMATOR = Estimator(MODEL, CAMERA)
 POSE = RigidTransform(rotation_exp(np.array([2.2, 0.1, 0.0])), np.array([0.0, 0.04, 0.4]))
 TURN, SIDE = 1, 2.1
 COUNT, SIGMA = 80, 0.05
 #: No load in ten frames, then more of it in each.
 LOADS = 0.03 * np.maximum(np.arange(24) - 9, 0)
+
+
+@cache  # not at import: each process of a run imports all tests, and would compile what the model is made with
+def model():
+    return with_revolution_angle(bent_tube(), AXIS)
+
+
+@cache
+def estimator():
+    return Estimator(model(), CAMERA)
 
 
 def seen_of(points, state, errors=0.0):
@@ -32,13 +41,18 @@ def seen_of(points, state, errors=0.0):
 
 def followed(seed, loads=LOADS):
     """Errors and stated deviations (f,) of the side, half of the noise being the same in all frames."""
-    points, rng, start, found = bound_points(MODEL, COUNT), np.random.default_rng(seed), State(MODEL.default, POSE), []
-    filtered, stays = SequenceFilter(ESTIMATOR, [TURN]), rng.standard_normal((COUNT, 2))
+    points, rng, start, found = (
+        bound_points(model(), COUNT),
+        np.random.default_rng(seed),
+        State(model().default, POSE),
+        [],
+    )
+    filtered, stays = SequenceFilter(estimator(), [TURN]), rng.standard_normal((COUNT, 2))
     for load in loads:
         errors = np.sqrt(0.5) * SIGMA * (stays + rng.standard_normal((COUNT, 2)))
         seen = seen_of(points, State(np.array([load, SIDE]), POSE), errors)
         starts = [State(np.array([0.1, side]), POSE) for side in (-2.0, 0.0, 2.0)]
-        alone = min((ESTIMATOR.fit(seen, one) for one in (start, *starts)), key=lambda estimate: estimate.cost)
+        alone = min((estimator().fit(seen, one) for one in (start, *starts)), key=lambda estimate: estimate.cost)
         estimate = filtered.fuse(seen, alone)
         start = estimate.state
         off = (start.parameters[TURN] - SIDE + np.pi) % (2.0 * np.pi) - np.pi
@@ -50,7 +64,7 @@ def test_the_side_of_what_is_not_bent_is_not_said_to_be_known():
     """Without regard to whether there is an effect it is 4 to 7 stated deviations off in these frames."""
     found = np.array([followed(seed) for seed in range(20)])
     off, bent = found[:, 0] / found[:, 1], LOADS > 0.0
-    spread_of_any = np.ptp([MODEL.lower[TURN], MODEL.upper[TURN]]) / np.sqrt(12.0)
+    spread_of_any = np.ptp([model().lower[TURN], model().upper[TURN]]) / np.sqrt(12.0)
     assert (found[:, 1][:, ~bent] > 0.95 * spread_of_any).all()
     # As soon as it bends the side is told, and as well as stated.
     assert (found[:, 1][:, bent] < 0.2).all()
@@ -72,22 +86,22 @@ def test_the_side_stays_known_when_what_was_bent_comes_back():
 @pytest.mark.parametrize(("lengths", "absent"), [(3.5, True), (4.5, False)])
 def test_an_effect_is_clear_from_four_standard_deviations_on(lengths, absent):
     """The side acts in proportion to the load."""
-    points, load = bound_points(MODEL, COUNT), 0.2
+    points, load = bound_points(model(), COUNT), 0.2
     state = State(np.array([load, SIDE]), POSE)
     seen = seen_of(points, state)
-    alone = ESTIMATOR.fit(seen, state)
+    alone = estimator().fit(seen, state)
 
     def linear_at(there):
-        return ESTIMATOR.linear(seen, replace(alone, state=there))
+        return estimator().linear(seen, replace(alone, state=there))
 
     others, turn = np.array([[load / lengths, 0.0]]), np.array([[0.0, 1.0]])
-    found = without_clear_effect(MODEL, linear_at(state), linear_at, state, others, turn, np.array([0.1]))
+    found = without_clear_effect(model(), linear_at(state), linear_at, state, others, turn, np.array([0.1]))
     assert found.tolist() == [absent]
 
 
 def test_what_is_held_leaves_the_others_as_if_it_were_known():
-    seen = seen_of(bound_points(MODEL, COUNT), State(np.array([0.3, SIDE]), POSE))
-    linear = ESTIMATOR.linear(seen, ESTIMATOR.fit(seen, State(np.array([0.3, SIDE]), POSE)))
+    seen = seen_of(bound_points(model(), COUNT), State(np.array([0.3, SIDE]), POSE))
+    linear = estimator().linear(seen, estimator().fit(seen, State(np.array([0.3, SIDE]), POSE)))
     others = np.delete(np.arange(8), TURN)
     expected = np.linalg.inv(np.delete(np.delete(linear.hessian, TURN, 0), TURN, 1))
     held = linear.holding(np.array([TURN]))

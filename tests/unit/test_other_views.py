@@ -1,5 +1,7 @@
 """What other keyframes say of a hypothesis: a wedge seen from around, with exact poses."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,8 +16,12 @@ from tests.support.rendered_object import CAMERA, scanned, shaded, wedge
 WORLD = SimilarityTransform(3.7, Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([0.5, -1.2, 2.0]))
 NODES, TRIANGLES, _ = wedge()
 EDGES = MeshEdges(NODES, TRIANGLES)
-DRAWINGS = EdgeDrawings.of(EDGES)
 CENTRE = 0.5 * (NODES.min(axis=0) + NODES.max(axis=0))
+
+
+@cache  # not at import: each process of a run imports all tests, and would compile what draws
+def drawings():
+    return EdgeDrawings.of(EDGES)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +31,7 @@ def views():
 
 def in_view(sizes, sides, turns, places):
     return InView(
-        DRAWINGS, CENTRE, EDGES.size, CAMERA, np.zeros(len(sizes)), np.asarray(sizes, dtype=float), np.asarray(sides),
+        drawings(), CENTRE, EDGES.size, CAMERA, np.zeros(len(sizes)), np.asarray(sizes, dtype=float), np.asarray(sides),
         np.asarray(turns), np.asarray(places, dtype=float),
     )  # fmt: skip
 
@@ -38,7 +44,7 @@ def gains_of(views, poses):
         rotations = np.array([pose.rotation for pose in there])
         middles = np.array([pose.apply(CENTRE) for pose in there])
         gains = edge_gains(view, LOOSE)
-        args = DRAWINGS.rotations[:, 2], DRAWINGS.points, DRAWINGS.tangents, CAMERA.intrinsics
+        args = drawings().rotations[:, 2], drawings().points, drawings().tangents, CAMERA.intrinsics
         total.append(added_gains(gains, rotations, middles, *args) / PER_GAIN)
     return np.mean(total, axis=0)
 
@@ -46,7 +52,7 @@ def gains_of(views, poses):
 def test_poses_have_the_object_where_it_was_drawn():
     """Against scipy's rotations: turned about the optical axis, then by the shortest way to the sight line."""
     rng = np.random.default_rng(4)
-    sides, turns = rng.integers(0, len(DRAWINGS.rotations), 20), rng.integers(0, N_TURNS, 20)
+    sides, turns = rng.integers(0, len(drawings().rotations), 20), rng.integers(0, N_TURNS, 20)
     places, sizes = rng.uniform([10.0, 10.0], [470.0, 350.0], (20, 2)), rng.uniform(40.0, 300.0, 20)
     rotations, middles = in_view(sizes, sides, turns, places).poses(np.arange(20))
     np.testing.assert_allclose(CAMERA.project(middles), places, atol=1e-9)
@@ -54,7 +60,7 @@ def test_poses_have_the_object_where_it_was_drawn():
     for rotation, middle, side, turn in zip(rotations, middles, sides, turns, strict=True):
         towards = Rotation.align_vectors([middle / np.linalg.norm(middle)], [[0.0, 0.0, 1.0]])[0]
         about = Rotation.from_euler("z", 360.0 * turn / N_TURNS, degrees=True)
-        np.testing.assert_allclose(rotation, (towards * about).as_matrix() @ DRAWINGS.rotations[side], atol=1e-9)
+        np.testing.assert_allclose(rotation, (towards * about).as_matrix() @ drawings().rotations[side], atol=1e-9)
 
 
 def test_edges_are_met_where_the_object_is_and_nowhere_near(views):
@@ -84,7 +90,7 @@ def test_of_hypotheses_in_one_keyframe_the_others_want_the_right_unit_and_attitu
     """One that is right to the steps of the search, with the true unit, and with others; and turned upside down."""
     view, others = views[3], [AskedView.of(views[k]) for k in (0, 5, 7)]
     pose = camera_from_object(view, WORLD)
-    sides, turns = (x.ravel() for x in np.meshgrid(np.arange(len(DRAWINGS.rotations)), np.arange(N_TURNS)))
+    sides, turns = (x.ravel() for x in np.meshgrid(np.arange(len(drawings().rotations)), np.arange(N_TURNS)))
     (place,), size = CAMERA.project(pose.apply(CENTRE)[None]), EDGES.size * CAMERA.fx / pose.apply(CENTRE)[2]
     found = in_view(np.full(len(sides), size), sides, turns, np.tile(place, (len(sides), 1)))
     rotations, _ = found.poses(np.arange(len(sides)))
