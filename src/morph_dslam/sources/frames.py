@@ -229,8 +229,10 @@ def read_image(path: Path, what: str) -> NDArray[np.uint8]:
 
 def turned_deg(path: Path, what: str) -> int:
     """By how many degrees an image is turned to be shown: 0, 90 to either side, or 180."""
-    stored = _decode(path, what, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    shown = read_image(path, what)
+    # At an eighth of the size, which of a JPEG is decoded in a fraction of the time.
+    stored, shown = (
+        _decode(path, what, cv2.IMREAD_REDUCED_GRAYSCALE_8 | flag) for flag in (cv2.IMREAD_IGNORE_ORIENTATION, 0)
+    )
     if shown.shape != stored.shape or any(np.array_equal(shown, np.rot90(stored, k)) for k in (1, -1)):
         return 0 if np.array_equal(shown, stored) else 90
     return 0 if np.array_equal(shown, stored) else 180
