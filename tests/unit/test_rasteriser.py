@@ -8,7 +8,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp
 from morph_dslam.model import SurfacePoints
 from morph_dslam.render.picking import nearest_on_outline, pick_surface
 from morph_dslam.render.rasteriser import rasterise, visible_points
-from morph_dslam.render.texture import render_textured
+from morph_dslam.render.texture import paint_textured, render_textured
 from tests.support.bent_sheet import bent_sheet_model
 
 CAMERA = Camera(96, 72, 80.0, 82.0, 47.0, 36.5)
@@ -101,6 +101,10 @@ def test_texture_that_is_a_ramp_reads_back_the_coordinates():
     np.testing.assert_array_equal(render_textured(buffers, triangles, coordinates, columns), image[:, :, 0])
     buffers.triangle_ids[:10] = -1
     assert not render_textured(buffers, triangles, coordinates, columns + np.uint8(1))[:10].any()
+    behind = np.full((*SIZE, 3), 17, dtype=np.uint8)
+    paint_textured(behind, buffers, triangles, coordinates, np.dstack([columns, rows, 255 - columns]))
+    assert (behind[:10] == 17).all()
+    np.testing.assert_array_equal(behind[10:], image[10:])
 
 
 def test_points_behind_a_nearer_square_are_hidden():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -28,7 +28,7 @@ from morph_dslam.render.scene_file import (
     interpolate_key_frames,
 )
 from morph_dslam.render.shading import lambert
-from morph_dslam.render.texture import load_photograph, render_textured, resize_to_fill
+from morph_dslam.render.texture import load_photograph, paint_textured, resize_to_fill
 from morph_dslam.units import to_si
 
 Array = NDArray[np.float64]
@@ -149,12 +149,11 @@ class StaticScene:
     def paint(self, image: Image, buffers: Buffers) -> None:
         """Draw the surroundings into an image (h, w, 3) wherever ``buffers`` are covered."""
         owners = np.where(buffers.covered, self._owners[buffers.triangle_ids], -1)
-        for number in np.unique(owners[owners >= 0]):
+        for number, texture in enumerate(self._textures):
             mine = owners == number
-            ids = np.where(mine, buffers.triangle_ids, np.int32(-1))
-            part = Buffers(ids, buffers.weights, buffers.depth)
-            drawn = render_textured(part, self._triangles, self._coordinates, self._textures[number])
-            image[mine] = drawn[mine]
+            if mine.any():
+                part = replace(buffers, triangle_ids=np.where(mine, buffers.triangle_ids, np.int32(-1)))
+                paint_textured(image, part, self._triangles, self._coordinates, texture)
 
 
 def _face_texture(face: _Face, folder: Path, pixels_per_metre: float) -> Image:

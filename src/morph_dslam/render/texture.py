@@ -114,32 +114,44 @@ def _sample_texture(triangle_ids, weights, triangles, coordinates, texture, imag
 def render_textured(
     buffers: Buffers, triangles: NDArray, texture_coordinates: Array, texture: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """Image of a textured surface.
+    """Image (h, w) or (h, w, channels) uint8 of a textured surface, 0 where there is no triangle.
 
     Parameters
     ----------
+    buffers, triangles, texture_coordinates, texture : as of `paint_textured`.
+    """
+    image = np.zeros((*buffers.triangle_ids.shape, *texture.shape[2:]), dtype=np.uint8)
+    paint_textured(image, buffers, triangles, texture_coordinates, texture)
+    return image
+
+
+def paint_textured(
+    image: NDArray[np.uint8],
+    buffers: Buffers,
+    triangles: NDArray,
+    texture_coordinates: Array,
+    texture: NDArray[np.uint8],
+) -> None:
+    """Draw a textured surface into an image, wherever there is a triangle.
+
+    Parameters
+    ----------
+    image : (h, w) or (h, w, channels) uint8.
     buffers : from `rasterise`, of the same triangles.
     triangles : (m, 3) node indices.
     texture_coordinates : (n, 2) column and row of each node in the texture, texture pixels; coordinates
         outside the texture take its border.
     texture : (H, W) or (H, W, channels) uint8.
-
-    Returns
-    -------
-    (h, w) or (h, w, channels) uint8, 0 where there is no triangle.
     """
-    height, width = buffers.triangle_ids.shape
-    layered = texture if texture.ndim == 3 else texture[:, :, None]
-    image = np.zeros((height, width, layered.shape[2]), dtype=np.uint8)
+    layered, drawn = (layers if layers.ndim == 3 else layers[:, :, None] for layers in (texture, image))
     _sample_texture(
         buffers.triangle_ids,
         buffers.weights,
         np.ascontiguousarray(triangles, dtype=np.int64),
         np.ascontiguousarray(texture_coordinates, dtype=np.float64),
         np.ascontiguousarray(layered),
-        image,
+        drawn,
     )
-    return image if texture.ndim == 3 else image[:, :, 0]
 
 
 def interpolate(buffers: Buffers, triangles: NDArray, node_values: NDArray) -> NDArray:
