@@ -369,7 +369,7 @@ def condensed_matrices(
     matrices = _tangents(moduli, stress, *state, *cells)
     coupling, inner = matrices[:, NODAL:, :NODAL], matrices[:, NODAL:, NODAL:]
     # Not compiled: numba takes four seconds to compile what solves equations.
-    follow = np.linalg.solve(inner, coupling)
+    follow = np.asarray(np.linalg.solve(inner, coupling), dtype=np.float64)
     small = matrices[:, :NODAL, :NODAL] - coupling.transpose(0, 2, 1) @ follow
     return small, follow, inner, _negative_pivots(inner.copy())
 
