@@ -1,11 +1,13 @@
 """Maps that were known before a recording: their keyframes belong to another one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from morph_dslam.camera import Camera
 from morph_dslam.errors import MapError, RegistrationError
-from morph_dslam.geometry import SimilarityTransform
+from morph_dslam.geometry import RigidTransform, SimilarityTransform, rotation_exp
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.io.trajectory import Trajectory
@@ -203,6 +205,27 @@ def test_a_map_that_agrees_in_the_reference_keyframe_alone_is_another_one(tmp_pa
     other = Scene(CAMERA, map_of(*map(keyframe, numbers, (0.5, 0.02, 0.45, 0.08))), NO_PATH)
     with pytest.raises(MapError, match="400 mm and 0 deg from where the registration has it in keyframe 13"):
         load_registration(tmp_path / "registration.json", model, other)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.0, 0.0, 5.0), (-0.195, 0.0, 0.59)], ids=["in", "far", "camera"])
+def test_a_map_is_told_by_where_it_has_the_object_and_not_the_origin_of_its_coordinates(origin):
+    """The object is 0.6 m away; the origin lies in it, 5 m before it, or 10 mm from a camera.
+
+    Its own map has one keyframe that the registration turned by 4 mrad about the object; in the other all cameras are
+    300 mm elsewhere.
+    """
+    model = bent_sheet_model(8, 6)
+    model = replace(model, nodes=model.nodes + origin)
+    centre = model.nodes.mean(axis=0)
+    placed = MapRegistration(SimilarityTransform(1.0, np.eye(3), [0, 0, 0.6] - centre), centre, 1e-8 * np.eye(7))
+    here, turned = placed.pose_in(at(0.0)), placed.pose_in(at(0.2))
+    seen, turn = turned.apply(centre), rotation_exp(np.array([0.0, 4e-3, 0.0]))
+    turned = RigidTransform(turn @ turned.rotation, turn @ (turned.translation - seen) + seen)
+    registration = registration_in_map(model, placed, [KeyframePose(0, here), KeyframePose(20, turned)], {})
+    assert in_scene(registration, Scene(CAMERA, map_of(keyframe(0, 0.0), keyframe(20, 0.2)), NO_PATH)).frame == 20
+    other = Scene(CAMERA, map_of(keyframe(0, 0.3), keyframe(20, 0.5)), NO_PATH)
+    with pytest.raises(MapError, match="the object is 300 mm and 0 deg from where the registration has it"):
+        in_scene(registration, other)
 
 
 def test_landmarks_in_a_number_of_two_recordings_are_refused():

@@ -415,12 +415,12 @@ def in_scene(registration: Registration, scene: Scene) -> Registration:
     # One without a covariance of its own is of no use beside others that have one: see `Registration.views`.
     last = max(views, key=lambda view: (view.frame == frame, view.covariance is not None, view.frame))
     off = {view.frame: _away(in_map, poses[view.frame], view.pose) for view in views}
-    far = [view for view in views if _is_elsewhere(view, *off[view.frame])]
-    if _is_elsewhere(last, *off[last.frame]) or len(far) > OTHER_MAP_SHARE * len(views):
-        turn, shift = off[far[-1].frame]
+    far = [view.frame for view in views if _is_elsewhere(in_map.centre, view.pose, *off[view.frame])]
+    if last.frame in far or len(far) > OTHER_MAP_SHARE * len(views):
+        turn, shift = off[far[-1]]
         raise MapError(
             f"{name} is not the map of the registration: by the map the object is {1e3 * shift:.0f} mm and "
-            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {far[-1].frame - more}"
+            f"{np.degrees(turn):.0f} deg from where the registration has it in keyframe {far[-1] - more}"
         )
     found = replace(
         registration, scene=scene, frame=last.frame, keyframes=tuple(views), renumbered=scene.map.renumbered
@@ -431,16 +431,16 @@ def in_scene(registration: Registration, scene: Scene) -> Registration:
     return replace(found, state=state, covariance=covariance)
 
 
-def _is_elsewhere(view: KeyframePose, turn: float, shift: float) -> bool:
-    """Whether an object that is off by so much (rad, metres) in a keyframe is that of another map."""
-    return turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * float(np.linalg.norm(view.pose.translation))
+def _is_elsewhere(centre: Array, pose: RigidTransform, turn: float, shift: float) -> bool:
+    """Whether an object whose ``pose`` in a keyframe is off by so much (rad, metres) is that of another map."""
+    return turn > OTHER_MAP_TURN or shift > OTHER_MAP_SHIFT * float(np.linalg.norm(pose.apply(centre)))
 
 
 def _away(in_map: MapRegistration, camera_from_world: Array, pose: RigidTransform) -> tuple[float, float]:
-    """By what (rad, metres) a camera_from_object is off that of a map's keyframe."""
-    by_map = in_map.pose_in(camera_from_world)
+    """By what (rad, metres) an object is off where a map's keyframe has it: the origin of its frame may be anywhere."""
+    by_map, centre = in_map.pose_in(camera_from_world), in_map.centre
     turn = float(np.linalg.norm(rotation_log(by_map.rotation @ pose.rotation.T)))
-    return turn, float(np.linalg.norm(by_map.translation - pose.translation))
+    return turn, float(np.linalg.norm(by_map.apply(centre) - pose.apply(centre)))
 
 
 def _state_content(state: State) -> dict[str, list]:
