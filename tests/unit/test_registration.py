@@ -200,6 +200,15 @@ def test_an_earlier_file_without_other_states_is_read(tmp_path):
     assert (read.alternatives, read.depth_scale) == ((), None)
 
 
+def test_an_earlier_file_that_does_not_name_its_own_keyframe_has_the_last_one(tmp_path):
+    path = tmp_path / "registration.json"
+    in_map(SHEET).save(path)
+    content = json.loads(path.read_text())
+    for named, frame in (({"frame": 3}, 3), ({}, 7)):
+        path.write_text(json.dumps({key: value for key, value in content.items() if key != "frame"} | named))
+        assert load_registration(path, SHEET).frame == frame
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -238,6 +247,8 @@ def test_damaged_registrations_are_refused(tmp_path):
         {"warnings": [{"kind": "nothing"}]},
         {"rivals": [{"world_from_object": np.eye(4).tolist(), "map_units_per_metre": 2.0, "score": 1.0}]},
         {"rivals": [{}]},
+        {"frame": 4},
+        {"frame": "last"},
         {"keyframes": []},
         {"keyframes": [keyframe | {"camera_from_object": [[1.0]]}]},
         {"keyframes": [keyframe | {"covariance": [[1.0]]}]},

@@ -294,6 +294,7 @@ class Registration:
             }
         placed, axis = self.map_registration.world_from_object, self.axis
         return content | {
+            "frame": self.frame,
             "world_from_object": placed.matrix.tolist(),
             "map_units_per_metre": placed.scale,
             "mean_node_m": self.map_registration.centre.tolist(),
@@ -351,9 +352,14 @@ def registration_in_map(
     warnings: Sequence[Notice] = (),
     axis: Axis | None = None,
     scene: Scene | None = None,
+    frame: int | None = None,
 ) -> Registration:
-    """The undeformed object in the last of the map's keyframes; of the arguments see `Registration`."""
-    last = max(keyframes, key=lambda view: view.frame)
+    """The undeformed object in keyframe ``frame`` of the map, the last by default; of the arguments see `Registration`.
+
+    Raises KeyError if the object's pose in that keyframe is not among ``keyframes``.
+    """
+    by_frame = {view.frame: view for view in keyframes}
+    chosen = by_frame[max(by_frame) if frame is None else frame]
     open_angles: tuple[str, ...] = ()
     if axis is not None:
         warnings = [w for w in warnings if not isinstance(w, AngleOpen | TurnArbitrary)]
@@ -365,8 +371,8 @@ def registration_in_map(
             warnings.append(TurnArbitrary())
     return Registration(
         model,
-        *_undeformed_in(last, model, map_registration),
-        last.frame,
+        *_undeformed_in(chosen, model, map_registration),
+        chosen.frame,
         facts,
         tuple(warnings),
         open_angles,
@@ -398,16 +404,16 @@ def in_scene(registration: Registration, scene: Scene) -> Registration:
     Where the map has grown by other recordings since, the registration takes over the numbers that its keyframes have
     now, without those that the map has no more. If its own one is among these, the last one left takes its place.
     """
-    name, in_map, before = scene.path or "the scene", registration.map_registration, registration.renumbered
+    name, in_map = scene.path or "the scene", registration.map_registration
     if in_map is None or registration.frame is None:
         raise MapError(f"{name} is not the map of the registration: it was made without one")
     poses = {each.index: each.camera_from_world for each in scene.keyframes}
-    since = scene.map.renumbered[len(before) :]
-    more, now = sum(since), scene.map.renumbered[: len(before)]
+    since = scene.map.renumbered[len(registration.renumbered) :]
+    more = sum(since)
     views = [replace(view, frame=view.frame + more) for view in registration.keyframes]
     gone = [view.frame - more for view in views if view.frame not in poses]
     # Only a map that grows takes keyframes out.
-    if now != before or len(gone) == len(views) or (gone and not since):
+    if len(gone) == len(views) or (gone and not since):
         missing = max(gone, default=registration.frame)
         raise MapError(f"{name} is not the map of the registration: it has no keyframe {missing} of it")
     views = [view for view in views if view.frame in poses]

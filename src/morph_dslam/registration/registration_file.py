@@ -37,7 +37,7 @@ OTHER_OBJECT = 0.1
 #: What is no figure for the summary in the file of a registration.
 _NO_FACTS = {"ambiguous", "warnings", "parameters", "camera_from_object", "state_covariance", "world_from_object"}
 _NO_FACTS |= {"mean_node_m", "covariance", "axis_of_revolution", "rivals", "keyframes", "map", "model", "alternatives"}
-_NO_FACTS |= {"map_renumbered"}
+_NO_FACTS |= {"map_renumbered", "frame"}
 
 
 def load_registration(path: str | Path, model: ReducedModel | None = None, scene: Scene | None = None) -> Registration:
@@ -112,10 +112,12 @@ def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
     found = MapRegistration(placed, _numbers(content["mean_node_m"], (3,)), _optional(content["covariance"], (7, 7)))
     axis = content["axis_of_revolution"]
     axis = axis and Axis(_numbers(axis["point_m"], (3,)), _numbers(axis["direction"], (3,)))
-    # Earlier files have neither.
+    # Earlier files have none of these.
+    frame = None if content.get("frame") is None else int(content["frame"])
     renumbered = tuple(int(more) for more in content.get("map_renumbered", []))
     rivals = [Rival(_placed(each), float(each["score"])) for each in content.get("rivals", [])]
-    registration = registration_in_map(model, found, _keyframes(content["keyframes"]), facts, warnings, axis)
+    keyframes = _keyframes(content["keyframes"])
+    registration = registration_in_map(model, found, keyframes, facts, warnings, axis, frame=frame)
     return replace(registration, rivals=tuple(rivals), renumbered=renumbered)
 
 
