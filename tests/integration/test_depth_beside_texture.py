@@ -11,6 +11,7 @@ import pytest
 import morph_dslam as md
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import Frame
+from morph_dslam.tracking import views
 from tests.integration.test_outline_beside_texture import CAMERA as BEFORE_BLOCK, SpottedFilm, state as block_state
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.clicked import clicked
@@ -92,6 +93,34 @@ def test_a_distance_by_depths_stays_as_uncertain_as_these_are():
     )
     by_registration /= np.sqrt(known.covariance[-1, -1])
     assert along == pytest.approx([by_registration] * 2, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_distance_by_depths_stays_as_it_is_in_views_that_frames_became(monkeypatch):
+    """The states in which frames became views are off with the depths' scale, and these do not correct them again."""
+    made: dict[int, list[tuple[float, float]]] = {}
+    is_first = False
+    monkeypatch.setattr(views, "choose_view", lambda shares, errors, active: None if is_first else active)
+    for seed in range(100, 108):
+        scene = Scene("sheet", seed, 1.0 + SCALE_STD * np.random.default_rng(seed).standard_normal())
+        frames = [scene.frame(time) for time in np.linspace(0.0, 0.25, 12)]
+        known = clicked(scene.model, CAMERA, scene.state(0.0), scene.rng, 0.7, depth=frames[0].depth)
+        options, last = md.TrackerOptions(least_inliers=16, use_depth=True), {}
+        tracker = md.Tracker(scene.model, CAMERA, known, options, reference=frames[0].image)
+        for number, frame in enumerate(frames):
+            is_first = number < 6  # a view is made of every third of these
+            found = tracker.track(frame)
+            assert found.estimate is not None
+            states = found.estimate.state, scene.state(frame.timestamp)
+            distances = [state.camera_from_object.translation[2] for state in states]
+            last[found.view] = distances[0] - distances[1], found.estimate.pose_std[5]
+        for view, pair in last.items():
+            made.setdefault(view, []).append(pair)
+    first, *others = (np.array(made[view]) for view in range(3))
+    for of_view in others:
+        assert np.sqrt(np.mean(of_view[:, 0] ** 2)) < 1.3 * np.sqrt(np.mean(first[:, 0] ** 2))
+        assert np.median(of_view[:, 1] / first[:, 1]) > 0.9
+        assert 0.4 < np.sqrt(np.mean((of_view[:, 0] / of_view[:, 1]) ** 2)) < 1.6
 
 
 @pytest.mark.slow

@@ -70,20 +70,60 @@ def test_it_does_not_average_out_over_frames():
     np.testing.assert_allclose(by_theory, np.abs(increment(right.state, wrong.state)), atol=2e-5)
 
 
-def test_a_reference_found_by_depths_is_as_far_off_as_these_and_they_do_not_hold_it_against_that():
-    """Depths by which the registration is a little too far away have the object there in all frames."""
-    true_points = bound_points(MODEL, 150, np.random.default_rng(1))
+def found_too_far_away(rng):
+    """A state that depths have too far away in one frame, and how another frame has the object by points bound in it.
+
+    Returns
+    -------
+    That state, its error factors, of which other causes' are a thousandth as large; the points, the other frame's
+    estimate and its depths.
+    """
+    true_points = bound_points(MODEL, 150, rng)
     seen, step = CAMERA.project(true_points.in_camera(REFERENCE)), np.zeros(9)
     step[8] = SCALE * true_points.in_camera(REFERENCE)[:, 2].mean()
     taken = moved(REFERENCE, step)
     surface, met = bind_pixels(MODEL, CAMERA, view_of(MODEL, CAMERA, taken), seen)
     true_points, points = true_points.take(np.flatnonzero(met)), BoundPoints.from_surface(MODEL, surface)
-    found, depths = estimated(points, true_points, 1.0 + SCALE)
-    off = np.abs(increment(TRUTH, found.state))
-    assert off[-1] * ESTIMATOR.scale[-1] > 0.8 * step[8]
-    # Other errors of the registration, a thousandth as large, make the factors as many as unknowns.
     factors = np.column_stack([step, 1e-3 * step[8] * np.eye(9)[:, :8]])
+    return taken, factors, points, *estimated(points, true_points, 1.0 + SCALE)
+
+
+def test_a_reference_found_by_depths_is_as_far_off_as_these_and_they_do_not_hold_it_against_that():
+    """Depths by which the registration is a little too far away have the object there in all frames."""
+    taken, factors, points, found, depths = found_too_far_away(np.random.default_rng(1))
+    off = np.abs(increment(TRUTH, found.state))
+    assert off[-1] * ESTIMATOR.scale[-1] > 0.8 * factors[8, 0]
     by_theory = stated(errors_of(points, factors, CommonDepthScale(SCALE, True), taken), found, depths)
     np.testing.assert_allclose(by_theory, off, atol=0.1 * off.max())
     # As if its distance were known by something else, depths would seem to hold it.
     assert stated(errors_of(points, factors, None, taken), found, depths)[-1] < 0.6 * off[-1]
+
+
+def test_a_state_that_frames_with_depths_found_is_off_with_their_scale_and_goes_on_being_so():
+    """As a view made from a frame is: of its error, the covariance with the scale is known, not only its own."""
+    taken, factors, points, found, depths = found_too_far_away(np.random.default_rng(1))
+    off = increment(TRUTH, found.state)
+    errors = errors_of(points, factors, CommonDepthScale(SCALE, with_state=SCALE * factors[:, 0]), taken)
+    np.testing.assert_allclose(stated(errors, found, depths), np.abs(off), atol=0.1 * np.abs(off).max())
+    # And a view that is made from this frame in turn gets the same of this state.
+    with_scale = errors.with_scale / (SCALE * ESTIMATOR.scale)
+    np.testing.assert_allclose(with_scale, off, atol=0.1 * np.abs(off).max())
+    assert not errors.told_by_depths
+    # As if the scale had no part in that state, it would seem known by both.
+    apart = errors_of(points, factors, CommonDepthScale(SCALE, with_state=np.zeros(9)), taken)
+    assert stated(apart, found, depths)[-1] < 0.8 * np.abs(off[-1])
+
+
+def test_the_part_of_the_scale_that_a_state_does_not_share_comes_beside_it():
+    """Half of the scale's variance is the state's error, the other half is independent: both move the estimate."""
+    taken, factors, points, found, depths = found_too_far_away(np.random.default_rng(1))
+    half = np.sqrt(0.5)
+    whole, together, alone = (
+        stated(errors_of(points, columns, scale, taken), found, depths) ** 2
+        for columns, scale in [
+            (factors, CommonDepthScale(SCALE, with_state=half * SCALE * factors[:, 0])),
+            (factors, CommonDepthScale(half * SCALE, with_state=half * SCALE * factors[:, 0])),
+            (np.zeros((9, 9)), CommonDepthScale(half * SCALE)),
+        ]
+    )
+    np.testing.assert_allclose(whole, together + alone, rtol=1e-6)

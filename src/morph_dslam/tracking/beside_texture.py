@@ -103,7 +103,8 @@ class BesideTexture:
         if ratio is None or not 1.0 / MOST_TIMES < ratio < MOST_TIMES:
             return replace(attempt, depth_unused=DepthNotUsed(ratio))
         attempt = replace(attempt, depths=depths.padded(len(self.reference.all_points)))
-        if self._makes_good(systematic, self._depth_check):
+        tells = systematic is not None and systematic.told_by_depths
+        if tells and self._makes_good(systematic, self._depth_check):
             found, minimum = self._corrected(attempt, attempt.estimate.state, systematic, self.scout)
             for _ in range(DEPTH_ROUNDS - 1):
                 found = self._weighed(replace(found, depths=attempt.depths), minimum.state)

@@ -39,10 +39,13 @@ class CommonDepthScale:
     ----------
     std : its standard deviation, a share.
     in_reference : whether the reference state was found by depths of the same scale, which is then off with it.
+    with_state : (d + 6,) covariance of the reference state's error with by what share all depths are too large, where
+        frames with such depths have found that state; None where they have not.
     """
 
     std: float = 0.0
     in_reference: bool = False
+    with_state: NDArray[np.float64] | None = None
 
     @classmethod
     def of(cls, found: DepthScale | None, std: float) -> CommonDepthScale:

@@ -42,6 +42,8 @@ from morph_dslam.tracking.reprojection import huber_weights, project_with_jacobi
 Array = NDArray[np.float64]
 #: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
 LARGEST_STRETCH = 5.0
+#: Error factors smaller than this share of the largest, in units of the unknowns, say nothing of the depths' scale.
+LEAST_FACTOR = 1e-9
 
 
 def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
@@ -73,6 +75,8 @@ class SystematicErrors:
     Attributes
     ----------
     beyond_reference : of the last frame; None where that does not tell, or the reference gets no blame.
+    with_scale : (d + 6,) covariance of the error of the last frame that was kept with by what share all depths are too
+        large, as far as the reference's error and the depths' scale make it.
     """
 
     def __init__(
@@ -97,7 +101,8 @@ class SystematicErrors:
         self._moved, self._factors = self._by_error_factors(parts), parts[0].error_factors
         self._shares = np.zeros(0 if self._moved is None else self._moved.shape[2])
         self._n_reference = len(self._shares)
-        self._take_scale(scale or CommonDepthScale(), parts)
+        self._scale = scale or CommonDepthScale()
+        self._take_scale(self._scale, parts)
         self._common = SharedErrors(self._places(parts[0].state), window)
         self.beyond_reference: BeyondReference | None = None
         self.forget_frames()
@@ -115,11 +120,16 @@ class SystematicErrors:
         """Find by what share each error factor has all depths too large; their scale may be one more factor.
 
         A reference state that was found by depths is as much too far away as these are too large: what its error
-        factors move the surface by along the pixels' sight lines, on average, is the scale's doing.
+        factors move the surface by along the pixels' sight lines, on average, is the scale's doing. Of a state that
+        frames with such depths have found it is known how far its error is the scale's.
         """
         if not scale.std:
             return
-        if scale.in_reference and self._moved is not None:
+        std = scale.std
+        if scale.with_state is not None and self._factors is not None:
+            self._shares = self._shares_of_state(scale)
+            std = float(np.sqrt(max(std**2 - float(self._shares @ self._shares), 0.0)))
+        elif scale.in_reference and self._moved is not None:
             farther = np.concatenate([self._farther(part) for part in parts])
             mean = np.mean(farther[np.isfinite(farther).all(axis=1)], axis=0)
             self._shares = scale.std * mean / max(float(np.linalg.norm(mean)), 1e-300)
@@ -127,9 +137,20 @@ class SystematicErrors:
         p = len(self._points)
         moved = np.zeros((p, 2, 0)) if self._moved is None else self._moved
         self._moved = np.concatenate([moved, np.zeros((p, 2, 1))], axis=2)
-        self._shares = np.append(self._shares, scale.std)
+        self._shares = np.append(self._shares, std)
         if self._factors is not None:
             self._factors = np.column_stack([self._factors, np.zeros(len(self._factors))])
+
+    def _shares_of_state(self, scale: CommonDepthScale) -> Array:
+        """By what share each of the reference state's error factors (c,) has all depths too large.
+
+        With the factors F of the state it is the a with F a = ``scale.with_state``, no more than the scale's deviation.
+        """
+        assert self._factors is not None
+        assert scale.with_state is not None
+        unit = self._estimator.scale
+        found = np.linalg.lstsq(self._factors / unit[:, None], scale.with_state / unit, rcond=LEAST_FACTOR)[0]
+        return np.asarray(found * min(1.0, scale.std / max(float(np.linalg.norm(found)), 1e-300)))
 
     def _farther(self, part: BoundPart) -> Array:
         """By what share each error factor has the surface at the pixels of a part's points farther away (p, c)."""
@@ -155,7 +176,7 @@ class SystematicErrors:
         """The next estimate does not rest on earlier ones, or their errors are in its covariance already."""
         size = len(self._estimator.scale)
         n_factors = 0 if self._moved is None else self._moved.shape[2]
-        self._by_reference = np.zeros((size, n_factors))
+        self._by_reference, self.with_scale = np.zeros((size, n_factors)), np.zeros(size)
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
@@ -251,6 +272,8 @@ class SystematicErrors:
                 self._learn_reference(frame, left[:, :, : self._n_reference], n_pairs)
             widened = by_reference * self._widening
             covariance += widened @ widened.T
+            if keeps:
+                self.with_scale = widened @ (self._shares if corrected is None else corrected.left @ self._shares)
             stated = stated + by_reference @ by_reference.T
         gradients = self._common.gradients(frame.weighted_jacobian)
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain, n_pairs)
@@ -343,6 +366,14 @@ class SystematicErrors:
     def knows_reference(self) -> bool:
         """Whether the reference's error is known, and none of the pose that holds in all frames."""
         return self._n_reference > 0 and not self._still
+
+    @property
+    def told_by_depths(self) -> bool:
+        """Whether depths tell of the reference's error: not of a state that frames with such depths have found.
+
+        That is off by what these are off by, alike in further frames, of which only the scale is known.
+        """
+        return self.knows_reference and self._scale.with_state is None
 
     def pushed_texture(
         self, state: State, residuals: Array, weights: Array, depths: PointDepths | None = None

@@ -312,11 +312,13 @@ class _BegunView:
     ----------
     error : as in `ActiveView`.
     seen : of `SurfaceSamples` in it.
+    scale : of the depths, with how far its state's error is theirs; None without them.
     """
 
     reference: ReferenceView
     error: float
     seen: Array
+    scale: CommonDepthScale | None
 
 
 class ViewSet:
@@ -449,7 +451,10 @@ class ViewSet:
         except RegistrationError:
             self._pause = PAUSE
             return None
-        return _BegunView(made, spread, now)
+        scale, systematic = self._scale, self.active.systematic
+        if scale is not None and systematic is not None:
+            scale = replace(scale, with_state=systematic.with_scale)
+        return _BegunView(made, spread, now, scale)
 
     def _of_one_instant(self, picture: Image, state: State) -> Image:
         """The picture as of the middle row's instant, around the object in ``state``."""
@@ -468,7 +473,7 @@ class ViewSet:
             self.active.reference.take_features()
             return None
         self._n_made += 1
-        view = ActiveView.of(begun.reference, self._estimator, self._options, self._n_made, begun.error, self._scale)
+        view = ActiveView.of(begun.reference, self._estimator, self._options, self._n_made, begun.error, begun.scale)
         self._kept.append(view)
         self._seen.append(begun.seen)
         if len(self._kept) > self._options.max_views:
