@@ -159,7 +159,7 @@ class BesideTexture:
         if systematic is None or not tells or np.isnan(squared_px):
             return attempt, found
         pushed = systematic.pushed_texture(found.state, found.residuals[rows], attempt.weights, depths)
-        asked = found, attempt.prior, pushed, squared_px, attempt.correction, self.balance.common_px
+        asked = found, pushed, squared_px, attempt.correction, self.balance.common_px
         attempt = replace(attempt, correction=reference_correction(self.estimator, together, *asked))
         return attempt, estimator.fitted(self.measured(attempt), found.state, attempt.prior)
 

@@ -9,6 +9,7 @@ motion of the object stays out of it, because the model's own errors look alike.
 by J G z, and of the reference's error that is left which neither outline nor registration tells.
 
 The prior is what the registration states, and not more by what frames seem to show: a model that is off would widen it.
+The pose that a map gives in a frame has the same z, as it rests on the same registration, and tells nothing of it.
 Texture and outline disagree by the model's error, too, where it cannot take the object's shape. That is none that z
 makes good: an outline that counts then pulls the points from where they fit. `CorrectionCheck` looks whether it does.
 
@@ -37,7 +38,6 @@ from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.outline_weight import mean_square
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, REFUTED
 from morph_dslam.tracking.reprojection import huber_weights
-from morph_dslam.tracking.state import Prior
 
 Array = NDArray[np.float64]
 #: A correction, which is to first order, may be off by this share of itself.
@@ -177,7 +177,6 @@ def reference_correction(
     estimator: Estimator,
     together: Observations,
     found: Minimum,
-    prior: Prior | None,
     texture: PushedTexture,
     squared_px: float,
     before: ReferenceCorrection | None,
@@ -190,14 +189,13 @@ def reference_correction(
     estimator : whose cost it is.
     together : the texture's points, corrected by what was found before, and then the outline's.
     found : the minimum.
-    prior : what is known of the frame's pose.
     texture : the points about the minimum.
     squared_px : variance of a number of weight one, times how many points of the texture count as one.
     before : the correction so far; None for the first one.
     common_px : as in `of_common_errors`.
     """
     count, state = len(texture.frame.usable), found.state
-    _, hessian, gradient, residuals = estimator.evaluated(together, state, prior)
+    _, hessian, gradient, residuals = estimator.evaluated(together, state)
     jacobian, outline = estimator.jacobian(together.points, state)[count:], slice(count, None)
     across = np.einsum("pkn,pk->pn", jacobian, together.normals[outline])
     off = np.einsum("pk,pk->p", residuals[outline], together.normals[outline])
