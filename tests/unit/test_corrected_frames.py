@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,7 @@ from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
+from morph_dslam.tracking.other_tilt import OtherTilt
 from morph_dslam.tracking.state import moved, pose_increment
 from morph_dslam.tracking.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
@@ -82,3 +84,16 @@ def test_a_pose_by_the_map_tells_nothing_of_the_registration_that_it_rests_on():
     found = frame.corrected(frame.by_points(known.prior(3, NOISE_PX**2)))
     assert found.correction is not None
     assert np.linalg.eigvalsh(found.correction.left) == pytest.approx(np.ones(7), abs=0.01)
+
+
+def test_a_correction_stays_where_depths_leave_one_tilt_only():
+    """From the mirrored one the cost leads back to the same minimum, without the correction."""
+    frame, apart = Frame(0, 2e-4), np.zeros(9)
+    attempt = frame.by_points()
+    apart[3] = 0.5
+    found = frame.corrected(replace(attempt, other_tilt=OtherTilt(attempt.estimate.state, apart, 0.0)))
+    assert found.correction is not None
+    kept = frame.estimation.with_other_tilt(found)
+    assert kept.other_tilt is None
+    assert kept.correction is found.correction
+    np.testing.assert_array_equal(kept.estimate.state.parameters, found.estimate.state.parameters)

@@ -216,7 +216,8 @@ class FrameEstimation:
             lambda start: self._scout.fitted(measured, start),
             self._reference.points, attempt.estimate.state, n_numbers, self._reference.redundancy,
         )  # fmt: skip
-        if other.ratio < -(LIKELIER**2):
+        # The state here is not where the cost without a correction is least: what leads back to it is no other tilt.
+        if not other.is_excluded and other.ratio < -(LIKELIER**2):
             taken, other = other.state, other.left(attempt.estimate.state)
             estimate = self._estimator.fit(measured, taken)
             attempt = replace(attempt, estimate=estimate, correction=None, by_points=estimate.state)
