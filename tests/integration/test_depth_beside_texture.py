@@ -12,6 +12,7 @@ import morph_dslam as md
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import Frame
 from morph_dslam.tracking import views
+from morph_dslam.tracking.frame_estimation import FrameEstimation
 from tests.integration.test_outline_beside_texture import CAMERA as BEFORE_BLOCK, SpottedFilm, state as block_state
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.clicked import clicked
@@ -80,6 +81,31 @@ def test_depths_make_good_what_clicks_were_off_by():
     assert by_clicks.max() > 0.05
     assert np.abs(off).max() < 0.3 * by_clicks.max()
     assert sizes.max() < 3.0
+
+
+def test_points_are_looked_for_where_they_are_and_not_where_the_correction_has_them(monkeypatch):
+    """They were looked for as far off as the correction moves them, 1.4 pixels here."""
+    scene, off = Scene("sheet", 1), []
+    frames = [scene.frame(time) for time in np.linspace(0.0, 0.375, 4)]
+    known = clicked(scene.model, CAMERA, scene.state(0.0), scene.rng, 3.0)
+    options = md.TrackerOptions(least_inliers=16, new_views=False, use_depth=True)
+    tracker = md.Tracker(scene.model, CAMERA, known, options, reference=frames[0].image)
+    correct = FrameEstimation.correct
+
+    def looking(self, picture, state, offsets, prior):
+        found = correct(self, picture, state, offsets, prior)
+        if offsets is not None:
+            away = (tracker.reference.projected(state) + offsets - found.measurement.recorded)[found.inliers]
+            off.append(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+        return found
+
+    monkeypatch.setattr(FrameEstimation, "correct", looking)
+    for frame in frames:
+        tracker.track(frame)
+    assert tracker.last_correction is not None
+    shift = np.sqrt(np.mean(np.sum(tracker.last_correction.shift**2, axis=1)))
+    assert shift > 0.8
+    assert max(off[1:]) < 0.3 * shift
 
 
 def test_a_distance_by_depths_stays_as_uncertain_as_these_are():

@@ -296,11 +296,12 @@ class Tracker:
             # Half of the size is exact enough for a start.
             found, ok = follow(self._image.half, image.half, 0.5 * self._pixels[rows], 0.5 * guesses[rows], LEVELS - 1)
             pixels, valid = guesses, np.zeros(len(guesses), dtype=bool)
-            found *= 2.0
+            # By the points, not as outline and depths correct the state: offsets are added to what `rough` has.
+            by_points, found = self.reference.projected(self._last_by_points), 2.0 * found
             if image.motion is not None:
-                found = image.motion.since_last(self.reference.projected(self._last_by_points)[rows], found)
+                found = image.motion.since_last(by_points[rows], found)
             pixels[rows], valid[rows] = found, ok
-            return Followed(pixels, valid, zero_where_unknown(self._pixels - last))
+            return Followed(pixels, valid, zero_where_unknown(self._pixels - by_points))
 
     def _match(self, image: Image, followed: Followed | None, prior: Prior | None) -> PoseHypothesis:
         """Compare with the rendered reference view and solve for pose and parameters."""
@@ -487,7 +488,9 @@ class Tracker:
             self._last_by_points = state
         self._history.replace_last(state)
         if self._views is not None:
-            self._pixels = np.where(self._supported[:, None], self._pixels, self.reference.projected(state))
+            self._pixels = np.where(
+                self._supported[:, None], self._pixels, self.reference.projected(self._last_by_points)
+            )
 
     def take_over(self, other: Tracker) -> None:
         """Go on after the last frame of another tracker of the object, with what that knows but for the pose."""
@@ -568,7 +571,7 @@ class Tracker:
         angles = self._registration.per_sequence
         self._start = next_start(estimate, self._velocity_base, self.model, self.options, angles)
         self._supported = inliers
-        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last))
+        self._pixels = np.where(inliers[:, None], found.recorded, self.reference.projected(self._last_by_points))
         self._anchoring.learn(estimate.sigma_px, self.last_measured.redundancy)
         self._view.estimation.learn(hypothesis, image)
         if not self._lost:
