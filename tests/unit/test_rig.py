@@ -353,21 +353,55 @@ def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_es
             moves[camera, :, k] = away_from(before.state, estimator.fit(RigObservations(tuple(views)), LATER).state)
     z, off, corrections = rng.standard_normal((20000, 3)), np.zeros((20000, 9)), []
     for camera, exactness in enumerate((10.0, 0.5)):
-        root = exactness * (np.eye(3) + 0.3 * rng.standard_normal((3, 3)))
+        # A camera that finds its depths' scale beside the factors has one more, which is in no other camera.
+        own = np.column_stack([z, rng.standard_normal((len(z), 1))]) if camera else z
+        count, nothing = own.shape[1], np.zeros(0)
+        root = exactness * (np.eye(count) + 0.3 * rng.standard_normal((count, count)))
         information = root @ root.T
-        told = z + np.linalg.solve(root.T, rng.standard_normal(z.shape).T).T
-        covariance = np.linalg.inv(np.eye(3) + information)
-        off += (z - told @ information @ covariance) @ moves[camera].T
-        # A camera that finds its depths' scale beside the factors has one more, which goes with them.
-        mixed = 0.3 * covariance[:, :1]
-        with_scale = np.block([[covariance, mixed], [mixed.T, covariance[:1, :1]]])
-        nothing, left = np.zeros(0), sqrtm(with_scale if camera else covariance).real
-        corrections.append(ReferenceCorrection(nothing, nothing, nothing, left, nothing))
-    errors, plain = RigErrors(trackers, RIG, [CommonDepthScale()] * 2), replace(before, covariance=np.zeros((9, 9)))
+        told = own + np.linalg.solve(root.T, rng.standard_normal(own.shape).T).T
+        covariance = np.linalg.inv(np.eye(count) + information)
+        off += (own - told @ information @ covariance)[:, :3] @ moves[camera].T
+        corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
+    errors = RigErrors(trackers, RIG, [CommonDepthScale(), CommonDepthScale(0.01)])
+    plain = replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
     scales = np.outer(estimator.scale, estimator.scale)
     drawn = np.cov(off.T) / scales
     np.testing.assert_allclose(stated / scales, drawn, atol=0.1 * np.linalg.norm(drawn))
+    np.testing.assert_allclose(np.sqrt(np.diag(stated / scales)), np.sqrt(np.diag(drawn)), rtol=0.2)
+
+
+def test_what_depths_leave_of_their_scale_goes_with_what_they_leave_of_the_reference_s_error(model):
+    """Against draws: the depths of each camera tell the difference of the distance's error and of their own scale's.
+
+    So both are off together: as the depths agree with the points, neither holds the estimate against the other's error.
+    """
+    step, std, told_std = 0.05 * STEPS[8], 5e-5, 0.1  # so small that all is linear
+    _, seen, trackers = estimated(model, [(REFERENCE, REFERENCE, step[:, None])], depth_weight=2000.0)
+    estimator = RigEstimator(model, RIG, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-9))
+    _, wrong, _ = estimated(model, [(REFERENCE, moved(REFERENCE, step), None)], depth_weight=2000.0)
+    before, moves = estimator.fit(seen, LATER), []
+    for camera, (right, other) in enumerate(zip(seen.views, wrong.views, strict=True)):
+        assert right.depths is not None
+        for one in (replace(other, depths=right.depths), replace(right, depths=right.depths.scaled(1.0 + std))):
+            views = [*seen.views[:camera], one, *seen.views[camera + 1 :]]
+            moves.append(away_from(before.state, estimator.fit(RigObservations(tuple(views)), LATER).state))
+    rng, direction = np.random.default_rng(7), np.array([1.0, -1.0]) / np.sqrt(2.0)
+    z, off, corrections, nothing = rng.standard_normal(20000), np.zeros((20000, 9)), [], np.zeros(0)
+    information = np.outer(direction, direction) / told_std**2
+    covariance = np.linalg.inv(np.eye(2) + information)
+    for camera in range(2):
+        own = np.column_stack([z, rng.standard_normal(len(z))])
+        told = own @ direction + told_std * rng.standard_normal(len(z))
+        left = own - np.outer(told, direction / told_std**2) @ covariance
+        off += left @ np.array(moves[2 * camera : 2 * camera + 2])
+        corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
+    errors = RigErrors(trackers, RIG, [CommonDepthScale(std)] * 2)
+    plain = replace(before, covariance=np.zeros((9, 9)))
+    stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
+    scales = np.outer(estimator.scale, estimator.scale)
+    drawn = np.cov(off.T) / scales
+    np.testing.assert_allclose(stated / scales, drawn, atol=0.2 * np.linalg.norm(drawn))
     np.testing.assert_allclose(np.sqrt(np.diag(stated / scales)), np.sqrt(np.diag(drawn)), rtol=0.2)
 
 

@@ -109,14 +109,14 @@ class ReferenceCorrection:
         shift[: len(self.nearer)] = self.nearer
         return replace(depths, depths=depths.depths - shift)
 
-    def left_by_cause(self, count: int) -> tuple[Array, Array]:
-        """What is left of the first ``count`` by what they are, and by the noise of what corrects; P and (P - P^2)^1/2.
+    def left_by_cause(self) -> tuple[Array, Array]:
+        """What is left of the error factors by what they are, and by the noise of what corrects; P and (P - P^2)^1/2.
 
-        P (count, count) is the covariance that is left. Corrected by (I - P) (z + n), with n of covariance
-        P (I - P)^-1, they are off by P z and by what n leaves. Several cameras have z in common, and each has an n of
-        its own.
+        P (c, c) is the covariance that is left. Corrected by (I - P) (z + n), with n of covariance
+        P (I - P)^-1, they are off by P z and by what n leaves. Several cameras have z in common but for the scales of
+        their depths, and each has an n of its own.
         """
-        values, vectors = np.linalg.eigh((self.left @ self.left)[:count, :count])
+        values, vectors = np.linalg.eigh(self.left @ self.left)
         shares = np.clip(values, 0.0, 1.0)
         of_noise = np.sqrt(shares * (1.0 - shares))
         return (vectors * shares) @ vectors.T, (vectors * of_noise) @ vectors.T

@@ -62,9 +62,10 @@ class RigErrors:
     points that were bound by it. Each camera sees e as C e, with C its chain from increments in the rig's frame
     to those in its own, so that the sum of C' J' W M J0 C over the cameras pushes the estimate. In other
     reference images of the undeformed object the same error factors make another e each. Where a camera's outline has
-    corrected its points, what is left of the factors takes their place (`ReferenceCorrection.left_by_cause`). What
-    neighbouring points of a camera's image have in common in the residuals enters as for one camera, each camera's by
-    itself.
+    corrected its points, or its depths have, what is left of the factors takes their place
+    (`ReferenceCorrection.left_by_cause`). Its depths' scale is then one of these, in which no other camera has a part.
+    What neighbouring points of a camera's image have in common in the residuals enters as for one camera, each
+    camera's by itself.
 
     Parameters
     ----------
@@ -83,8 +84,7 @@ class RigErrors:
         self._chains, self._depth_scales = [part.chain(len(self._scale) - 6) for part in cameras], scales
         self._systematic = [
             SystematicErrors(
-                tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW,
-                scale=scale if scale.in_reference else None,
+                tracker.estimator, tracker.reference.points, tracker.reference.parts, PATCH_WINDOW, scale=scale
             )
             for tracker, scale in zip(trackers, scales, strict=True)
         ]  # fmt: skip
@@ -127,7 +127,7 @@ class RigErrors:
         moved = self._moved_by_depths(hessian, views)
         covariance = covariance + moved @ moved.T
         if self._is_known:
-            transfer = gain @ _pushed_by_reference(both)
+            transfer = gain @ self._pushed_by_reference(both)
             covariance, stated = (part + transfer @ transfer.T for part in (covariance, stated))
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
@@ -135,13 +135,14 @@ class RigErrors:
         """How the scale of each camera's depths moves the estimate (d + 6, k), to either side.
 
         By one deviation, and in squares by what the depths are seen to be off; that of depths by which the reference
-        state was found is among its errors. Steps are finite, with what depths count
+        state was found, or which were corrected with it, is among its errors. Steps are finite, with what depths count
         there: the other cameras hold the estimate, so all depths of a camera whose scale is off are far from it, and
         Huber's cost lets them pull no more than they do.
         """
         moved = [np.empty((len(hessian), 0))]
         for scale, tracker, view in zip(self._depth_scales, self._trackers, views, strict=True):
-            if view.depths is None or not scale.std or scale.in_reference:
+            among_others = scale.in_reference or (self._is_known and view.corrected is not None)
+            if view.depths is None or not scale.std or among_others:
                 continue
             state, points = view.estimate.state, tracker.reference.points
             ratio = view.depths.ratio_to(points.in_camera(state)[:, 2])
@@ -153,6 +154,28 @@ class RigErrors:
                 step = inverse_of_seen(hessian + more, self._scale) @ view.chain.T @ (now[2] - then[2])
                 moved.append(step[:, None] / np.sqrt(2.0))
         return np.concatenate(moved, axis=1)
+
+    def _pushed_by_reference(self, views: Sequence[tuple[CameraView, Linearization]]) -> Array:
+        """How the reference's error enters the gradient of all cameras (d + 6, k), by independent causes.
+
+        Beyond the factors of the reference, a camera that was corrected has that of its depths' scale.
+
+        Parameters
+        ----------
+        views : with the points about the estimate.
+        """
+        factors = self._trackers[0].reference.parts[0].error_factors
+        assert factors is not None
+        in_common, by_one = [], []
+        for view, frame in views:
+            push = view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths)
+            if view.corrected is not None:
+                push = push[:, : len(view.corrected.left)]
+                of_factors, of_noise = view.corrected.left_by_cause()
+                by_one += [push @ of_noise, push @ of_factors[:, factors.shape[1] :]]
+                push = push @ of_factors
+            in_common.append(push[:, : factors.shape[1]])
+        return np.concatenate([np.sum(in_common, axis=0), *by_one], axis=1)
 
     def views(
         self,
@@ -179,20 +202,3 @@ class RigErrors:
             seen = replace(estimate, state=state, residuals=residuals[:count])
             views.append(CameraView(chain, systematic, seen, view.weights[:count], depths, of_others, correction))
         return views
-
-
-def _pushed_by_reference(views: Sequence[tuple[CameraView, Linearization]]) -> Array:
-    """How the reference's error enters the gradient of all cameras (d + 6, k), by independent causes.
-
-    ``views`` : with the points about the estimate.
-    """
-    in_common, by_noise = [], []
-    for view, frame in views:
-        push = view.chain.T @ view.systematic.pushed(frame, view.estimate.state, view.depths)
-        if view.corrected is not None:
-            # Beyond the factors of the reference its camera may know one of its depths' scale.
-            of_reference, of_noise = view.corrected.left_by_cause(push.shape[1])
-            by_noise.append(push @ of_noise)
-            push = push @ of_reference
-        in_common.append(push)
-    return np.concatenate([np.sum(in_common, axis=0), *by_noise], axis=1)
