@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,12 @@ from morph_dslam.evaluation.run_folder import remarks
 from morph_dslam.extend.reports import PointTruth
 from morph_dslam.extend.slam import Trajectory
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.camera_files import save_camera
+from morph_dslam.model import save_model
 from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.row_motion import RowMotion
+from morph_dslam.tracking.run_folder import write_hdf5
+from morph_dslam.tracking.run_results import RunResults
 from morph_dslam.tracking.state import State
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.run_folders import CAMERA, FRAMES, exact_truth, states, write_run
@@ -148,3 +154,16 @@ def test_paths_in_memory_are_compared():
     assert figures["sim3"]["scale"] == pytest.approx(0.5)
     assert figures["sim3"]["absolute_mm"]["max"] < 1e-6
     assert figures["truth_length_m"] == pytest.approx(10.0 + 19.0 * np.sqrt(2.0))
+
+
+def test_a_run_says_where_its_tracker_knew_how_the_object_moved(results, tmp_path):
+    """In memory, and in a run folder."""
+    last, run = results[14].estimate.state, RunResults(results[10].model, reference_frame=10)
+    results[15] = replace(results[15], motion=RowMotion(CAMERA, np.zeros(3), ((1.0 / 30.0, last),)))
+    for frame, result in results.items():
+        run.add(frame, frame / 30.0, result)
+    write_hdf5(tmp_path / "result.h5", run)
+    save_model(tmp_path / "model.morph", run.model)
+    save_camera(tmp_path / "camera.yaml", CAMERA)
+    for found in (md.Run.of(CAMERA, results), md.load_run(tmp_path)):
+        assert found.motion_known.tolist() == [frame == 15 for frame in found.frames]

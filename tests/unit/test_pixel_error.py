@@ -80,10 +80,11 @@ def slid(seconds):
     return 0.1 * seconds + 1.2 * seconds**2
 
 
-def rolling_run(timestamps):
-    run = sliding_run(ROLLING)
-    run.camera_from_object[:, 0, 3] = slid(INTERVAL * np.arange(len(FRAMES)))
-    return replace(run, timestamps=timestamps)
+def rolling_run(timestamps, anew=(20,)):
+    """Exact at the middle row's instant, save in frames where the tracker began ``anew``: there as the row of "b" is."""
+    run, instants, known = sliding_run(ROLLING), INTERVAL * np.arange(len(FRAMES)), ~np.isin(FRAMES, anew)
+    run.camera_from_object[:, 0, 3] = slid(instants + np.where(known, 0.0, READOUT * (284.0 - 239.5) / 480.0))
+    return replace(run, timestamps=timestamps, motion_known=known)
 
 
 def by_rows():
@@ -104,17 +105,16 @@ def test_tracks_of_a_rolling_shutter_are_compared_where_its_rows_show_the_points
 
 
 @pytest.mark.parametrize("away_s", [0.0, 1.0])
-def test_a_frame_whose_motion_the_tracker_did_not_know_is_compared_as_it_was_estimated(away_s):
-    """The first one, and that after a loss, or after a gap too; their states are as the rows of "b" show it."""
+@pytest.mark.parametrize("before", ["tracked", "lost"])
+def test_a_frame_whose_motion_the_tracker_did_not_know_is_compared_as_it_was_estimated(before, away_s):
+    """The first one, and one after a new registration, after a gap, or after a loss."""
     times = INTERVAL * np.arange(len(FRAMES)) + np.where(FRAMES > 22, away_s, 0.0)
-    run, instants = rolling_run(times), INTERVAL * np.arange(len(FRAMES)) + READOUT * (284.0 - 239.5) / 480.0
-    as_seen = np.isin(FRAMES, [20, 23])
-    run.camera_from_object[as_seen, 0, 3] = slid(instants[as_seen])
-    run.parameters[FRAMES == 22] = np.nan
-    words = np.where(FRAMES == 22, "lost", "tracked")
+    run = rolling_run(times, anew=(20, 23))
+    run.parameters[(FRAMES == 22) & (before == "lost")] = np.nan
+    words = np.where(FRAMES == 22, before, "tracked")
     only_b = PixelTracks(("b",), FRAMES, by_rows()[:, 1:2])
     figures = evaluate_pixels(replace(run, status=tuple(words.tolist())), only_b)
-    assert figures["frames_compared"] == [21, 23, 24, 25]
+    assert figures["frames_compared"] == [21, *[22] * (before == "tracked"), 23, 24, 25]
     assert figures["per_frame"]["23"]["max_px"] < 1e-6
     # Beside such a frame others tell less exactly how the sheet moves, from evenly to faster.
     assert figures["max_px"] < 0.2
@@ -123,19 +123,33 @@ def test_a_frame_whose_motion_the_tracker_did_not_know_is_compared_as_it_was_est
     assert "--bind-frame" in note
 
 
+def test_frames_whose_motion_the_tracker_did_not_know_are_the_last_to_tell_of_others():
+    """A parabola through three exact places is the path; frame 23 was registered anew."""
+    run = rolling_run(INTERVAL * np.arange(len(FRAMES)), anew=(20, 23))
+    figures = evaluate_pixels(run, PixelTracks(("b",), FRAMES, by_rows()[:, 1:2]))
+    errors = {frame: error["max_px"] for frame, error in figures["per_frame"].items()}
+    assert max(errors[frame] for frame in ("22", "24")) < 1e-6
+    assert min(errors["21"], errors["25"]) > 1e-3, "two frames away there is but one that is exact"
+
+
 def test_a_point_that_moves_across_the_rows_is_found_in_its_row():
     """It goes down by w = 264 pixels a second: v = v0 + w (v - 239.5) r / 480, solved for v."""
     run, times = sliding_run(ROLLING), INTERVAL * np.arange(len(FRAMES))
     run.camera_from_object[:, 0, 3], run.camera_from_object[:, 1, 3] = 0.0, 0.3 * times
     pixels, share = np.tile(projected()[:1], (len(FRAMES), 1, 1)), 264.0 * READOUT / 480.0
     pixels[..., 1] = (pixels[..., 1] + 264.0 * times[:, None] - share * 239.5) / (1.0 - share)
-    run = replace(run, timestamps=times)
+    run = replace(run, timestamps=times, motion_known=FRAMES > 20)
     assert evaluate_pixels(run, tracks(pixels[1:], FRAMES[1:]))["max_px"] < 1e-4
 
 
-@pytest.mark.parametrize("timestamps", [None, 0.5 * np.arange(len(FRAMES))])
-def test_a_rolling_shutter_whose_motion_is_not_known_is_named(timestamps):
-    figures = evaluate_pixels(rolling_run(timestamps), tracks(by_rows()))
+@pytest.mark.parametrize(
+    ("timestamps", "known"),
+    [(None, FRAMES > 20), (0.5 * np.arange(len(FRAMES)), FRAMES < 20), (INTERVAL * np.arange(len(FRAMES)), None)],
+    ids=["no-times", "rare", "not-said"],
+)
+def test_a_rolling_shutter_whose_motion_is_not_known_is_named(timestamps, known):
+    run = replace(rolling_run(INTERVAL * np.arange(len(FRAMES)), anew=()), timestamps=timestamps, motion_known=known)
+    figures = evaluate_pixels(run, tracks(by_rows()))
     assert figures["per_track"]["b"]["max_px"] > 0.5
     (note,) = figures["notes"]
     assert "20, 21, 22, 23, 24 and 25" in note

@@ -46,6 +46,8 @@ class Run:
     covariances : (f, d + 6, d + 6) of parameters, rotation vector and translation, SI, NaN where not tracked; None of
         a run that has not kept them.
     timestamps : (f,) seconds; None where they are not known. A rolling shutter needs them.
+    motion_known : (f,) whether the tracker knew how the object moved while a rolling shutter recorded the frame; None
+        of a run that does not say.
     """
 
     model: ReducedModel
@@ -59,6 +61,7 @@ class Run:
     discrepancies: dict[int, Discrepancy] = field(default_factory=dict)
     covariances: Array | None = None
     timestamps: Array | None = None
+    motion_known: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(
@@ -97,6 +100,7 @@ class Run:
             discrepancies={row: r.discrepancy for row, r in enumerate(found) if r.discrepancy is not None},
             covariances=np.array([result.covariance for result in found]),
             timestamps=None if timestamps is None else np.array([timestamps[frame] for frame in results], dtype=float),
+            motion_known=np.array([result.motion is not None for result in found]),
         )
 
     @property
@@ -162,6 +166,7 @@ def load_run(folder: str | Path) -> Run:
             discrepancies=load_discrepancies(file),
             covariances=np.asarray(file["covariance"]).astype(float) if "covariance" in file else None,
             timestamps=np.asarray(file["timestamp"]).astype(float),
+            motion_known=np.asarray(file["motion_known"]).astype(bool) if "motion_known" in file else None,
         )
     if not len(run.frames):
         raise EvaluationError(f"{path} holds no frames: track again")

@@ -156,6 +156,7 @@ def write_hdf5(path: Path, run: RunResults, centres: InnerCentres | None = None)
         file["camera_from_object"], file["parameters"] = run.poses(), run.parameters()
         file["pose_from"] = np.array([result.pose_from for result in run.results], dtype=text)
         file["pose_std"] = run.pose_std()
+        file["motion_known"] = np.array([result.motion is not None for result in run.results])
         file["parameter_std"], file["at_bound"] = run.parameter_std(), run.at_bound()
         file.create_dataset("covariance", data=run.covariances(), compression="gzip")
         file["largest_displacement"], file["largest_displacement_std"] = run.largest_displacements().T
