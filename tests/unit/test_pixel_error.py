@@ -128,7 +128,8 @@ def test_frames_whose_motion_the_tracker_did_not_know_are_the_last_to_tell_of_ot
     run = rolling_run(INTERVAL * np.arange(len(FRAMES)), anew=(20, 23))
     figures = evaluate_pixels(run, PixelTracks(("b",), FRAMES, by_rows()[:, 1:2]))
     errors = {frame: error["max_px"] for frame, error in figures["per_frame"].items()}
-    assert max(errors[frame] for frame in ("22", "24")) < 1e-6
+    # Nodes are moved by their own rows, and "b", which is bound where nothing is moved, lies between them.
+    assert max(errors[frame] for frame in ("22", "24")) < 1e-4
     assert min(errors["21"], errors["25"]) > 1e-3, "two frames away there is but one that is exact"
 
 
