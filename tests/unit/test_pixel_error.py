@@ -81,7 +81,7 @@ def slid(seconds):
 
 
 def rolling_run(timestamps, anew=(20,)):
-    """Exact at the middle row's instant, save in frames where the tracker began ``anew``: there as the row of "b" is."""
+    """Exact at the middle row's instant, in frames where the tracker began ``anew`` at that of the row of "b"."""
     run, instants, known = sliding_run(ROLLING), INTERVAL * np.arange(len(FRAMES)), ~np.isin(FRAMES, anew)
     run.camera_from_object[:, 0, 3] = slid(instants + np.where(known, 0.0, READOUT * (284.0 - 239.5) / 480.0))
     return replace(run, timestamps=timestamps, motion_known=known)
