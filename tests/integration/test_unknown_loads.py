@@ -14,7 +14,7 @@ from morph_dslam import Camera, build, make_study
 from morph_dslam.cli import app as cli
 from morph_dslam.errors import ModelFileError, StudyError
 from morph_dslam.geometry import RigidTransform
-from morph_dslam.mechanics.load_modes import softest_tractions
+from morph_dslam.mechanics.load_modes import pressing_tractions, softest_tractions
 from morph_dslam.mechanics.loads import FollowerPressure
 from morph_dslam.mechanics.materials.isotropic import LinearElastic
 from morph_dslam.mechanics.parameters import ParameterSymbols
@@ -161,6 +161,21 @@ def test_the_softest_traction_of_a_guided_block_is_uniform():
     np.testing.assert_allclose(nodal[~on_top], 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("cells", ["hex8", "hex20", "hex27", "tet10"])
+def test_the_resultant_of_pressures_is_what_the_support_holds(cells):
+    """Statics, by reactions that finite elements add up."""
+    mesh = block((0.03, 0.02, 0.01), (3, 2, 1), cells)
+    problem = SolidProblem(mesh, {"all": LinearElastic(young=2e5, poisson=0.3)}, [fixed("z_min")])
+    state = problem.initial_state()
+    surface = problem.loaded_surface("z_max", inward=True)
+    tractions = 1e-3 * pressing_tractions(surface, mesh.nodes, 4)
+    changes = problem.linearise(state.dofs, state.mu).solve(surface.loads(tractions))
+    for change, resultant in zip(changes, surface.resultants(tractions), strict=True):
+        force, moment = problem.reactions(state.dofs + change, state.mu, "z_min", about=np.zeros(3))
+        np.testing.assert_allclose(force, -resultant[:3], atol=1e-5 * abs(resultant[2]))
+        np.testing.assert_allclose(moment, -resultant[3:], atol=1e-5 * 0.03 * abs(resultant[2]))
+
+
 def test_terms_of_the_prior_agree_with_differences(loaded):
     prior, rng = LoadPrior(loaded.energy, LoadOptions()), np.random.default_rng(1)
     at = np.array([300.0, *(0.03 * rng.random(25))])
@@ -232,7 +247,7 @@ def test_spots_do_the_work_that_loads_do_on_what_they_cause(loaded, displacement
     # Of the widest spots, three times as wide as the nodes are apart.
     shape = np.exp(-0.5 * (np.linalg.norm(model.nodes[surface.on_surface] - places[spot], axis=1) / 0.0225) ** 2)
     coefficients = np.linalg.lstsq(surface.at_nodes[surface.on_surface].toarray(), shape, rcond=None)[0][None, None]
-    force = np.linalg.norm(surface.resultants(coefficients, model.nodes)[0, :3])
+    force = np.linalg.norm(surface.resultants(coefficients)[0, :3])
     moved = problem.nodal_displacement(tangent.solve(surface.loads(coefficients))[0] / force)[loads.nodes]
     work = np.einsum("n,ncm,nc->m", node_areas(model, loads.nodes), loads.tractions, moved)
     # A spot's force points outwards, along the normal, and so against the pressure.

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import KDTree
 
+from morph_dslam.mechanics.spaces import DisplacementSpace
 from morph_dslam.model.discrepancy import farthest_points
 
 Array = NDArray[np.float64]
@@ -46,6 +47,7 @@ class LoadedSurface:
     dofs : (k,) scalar dofs.
     mass : sparse (k, k), integrals of the functions' products over the undeformed surface, m2.
     at_nodes : sparse (n, k), values at the nodes of the model's mesh; zero beside the surface.
+    linear : (4, k) coefficients of the functions 1, x, y and z, the latter in metres.
     directions : (a, 3, k) unit vectors at each dof.
     n_scalar : scalar dofs of a component; those of x come first, then those of y and of z.
     n_dofs : of the problem.
@@ -54,25 +56,26 @@ class LoadedSurface:
     dofs: NDArray[np.int64]
     mass: Any
     at_nodes: Any
+    linear: Array
     directions: Array
     n_scalar: int
     n_dofs: int
 
     @classmethod
-    def of(
-        cls, scalar: ngs.FESpace, region: ngs.Region, at_nodes: Any, n_dofs: int, inward: bool = False
-    ) -> LoadedSurface:
-        """The functions of a ``scalar`` space that a ``region`` sees, with values ``at_nodes`` (n, n_scalar).
+    def of(cls, space: DisplacementSpace, region: ngs.Region, n_dofs: int, inward: bool = False) -> LoadedSurface:
+        """The functions of a displacement's component that a ``region`` sees.
 
         Tractions act along the inward normal only, or in any direction.
         """
+        scalar = space.scalar
         mass = _mass(scalar, region, ngs.CF(1.0))
         dofs = np.flatnonzero(mass.diagonal() > 0.0)
         directions = np.repeat(np.eye(3)[:, :, None], len(dofs), axis=2)
         if inward:
             parts = [_mass(scalar, region, ngs.specialcf.normal(3)[i]).diagonal()[dofs] for i in range(3)]
             directions = -np.array([parts]) / np.linalg.norm(parts, axis=0)
-        return cls(dofs, mass[dofs][:, dofs], at_nodes[:, dofs], directions, scalar.ndof, n_dofs)
+        linear = np.vstack([space.constant, space.coordinates.T])[:, dofs]
+        return cls(dofs, mass[dofs][:, dofs], space.node_values[:, dofs], linear, directions, scalar.ndof, n_dofs)
 
     @property
     def _places(self) -> NDArray[np.int64]:
@@ -106,19 +109,11 @@ class LoadedSurface:
         flat = self.at_nodes @ self.components(tractions).reshape(-1, len(self.dofs)).T
         return np.moveaxis(flat.reshape(-1, len(tractions), 3), 0, 1)
 
-    def resultants(self, tractions: Array, nodes: Array) -> Array:
-        """Force, N, and moment about the origin, N m, (c, 6) of tractions (c, a, k).
-
-        ``nodes`` (n, 3) are those of the mesh, m.
-        """
-        here = self.on_surface
-        # Of the functions 1, x, y and z: functions of higher order have no nodal values of their own.
-        known = np.column_stack([np.ones(len(here)), nodes[here]])
-        one, *position = np.linalg.lstsq(self.at_nodes[here].toarray(), known, rcond=None)[0].T
-        weighted = self._weighted(self.components(tractions))
-        x, y, z = (weighted @ coordinate for coordinate in position)
+    def resultants(self, tractions: Array) -> Array:
+        """Force, N, and moment about the origin, N m, (c, 6) of tractions (c, a, k)."""
+        force, x, y, z = (self._weighted(self.components(tractions)) @ function for function in self.linear)
         about = np.stack([y[:, 2] - z[:, 1], z[:, 0] - x[:, 2], x[:, 1] - y[:, 0]], axis=1)
-        return np.hstack([weighted @ one, about])
+        return np.hstack([force, about])
 
     def can_move(self, free: NDArray[np.bool_]) -> bool:
         """Whether a traction can move the surface, of whose dofs (n_dofs,) those that are not ``free`` are held."""

@@ -165,7 +165,7 @@ class ShellProblem(SolidProblem):
         """See `SolidProblem.loaded_surface`; without a name all of the shell."""
         space = self.displacements
         region = self.geometry.boundary(name) if name else self.geometry.region("all")
-        return LoadedSurface.of(space.scalar, region, space.node_values, self.n_dofs, inward)
+        return LoadedSurface.of(space, region, self.n_dofs, inward)
 
     @cached_property
     def units(self) -> tuple[float, float]:

@@ -91,7 +91,7 @@ def reduce_unknown_loads(
         inward,
         nodes,
         np.ascontiguousarray(np.moveaxis(nodal[:, nodes], 0, 2)),
-        surface.resultants(tractions, snapshots.mesh.nodes),
+        surface.resultants(tractions),
         {name: field for name, (field, _) in reduced.items()},
         None if second is None else SecondOrder(soft, second[0]),
     )
