@@ -8,6 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 from scipy.stats import multivariate_normal
 
 from morph_dslam import Camera, build, make_study
@@ -174,6 +175,21 @@ def test_the_resultant_of_pressures_is_what_the_support_holds(cells):
         force, moment = problem.reactions(state.dofs + change, state.mu, "z_min", about=np.zeros(3))
         np.testing.assert_allclose(force, -resultant[:3], atol=1e-5 * abs(resultant[2]))
         np.testing.assert_allclose(moment, -resultant[3:], atol=1e-5 * 0.03 * abs(resultant[2]))
+
+
+def test_the_place_of_a_ball_is_read_from_coarse_loads(loaded):
+    """Hertz's pressure about random places, by loads that are 12 mm apart; its radius is 12 mm, too."""
+    loads, reactions, rng = loaded.energy.loads, Reactions(loaded), np.random.default_rng(0)
+    areas, errors = np.sqrt(node_areas(loaded, loads.nodes)), []
+    for place in rng.uniform(0.015, 0.045, (40, 2)):
+        distance = np.linalg.norm(loaded.nodes[loads.nodes, :2] - place, axis=1)
+        pressure = np.sqrt(np.maximum(1.0 - (distance / 0.012) ** 2, 0.0))
+        coefficients, _ = nnls(-loads.tractions[:, 2] * areas[:, None], pressure * areas)
+        point, force = reactions.forces(np.array([0.0, *(1e-3 * coefficients / coefficients.max())]))[LOADS]
+        assert force[2] < 0.0
+        errors.append(np.linalg.norm(point[:2] - place))
+    assert np.mean(errors) < 2e-3
+    assert np.max(errors) < 4e-3
 
 
 def test_terms_of_the_prior_agree_with_differences(loaded):

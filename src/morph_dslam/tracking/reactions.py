@@ -22,8 +22,6 @@ from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import beyond_first_order
 
 Array = NDArray[np.float64]
-#: Unknown loads are where their traction is at least this part of its largest value.
-MOST = 0.5
 #: Values (3,) of a field at parameters, and their derivatives (d, 3).
 _Field = Callable[[Array], tuple[Array, Array]]
 
@@ -69,7 +67,7 @@ class Reaction:
     Attributes
     ----------
     point : (3,) mean of the deformed nodes that the support holds, object frame, m; the origin for a model file that
-        does not name them; of unknown loads where most of their traction is.
+        does not name them; of unknown loads the mean of the deformed nodes by the square of their traction.
     force : N.
     moment : about the point, N m.
     """
@@ -152,11 +150,11 @@ def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
         areas = node_areas(model, held)
 
         def place(mu: Array) -> tuple[Array, Array]:
-            # Where most of it acts: small tractions all over the surface would draw the mean to its middle.
-            sizes = np.linalg.norm(traction.value(mu)[held], axis=1)
-            most = np.where(sizes >= MOST * sizes.max(initial=0.0), sizes * areas, 0.0)
+            # By their squares: small tractions all over the surface would draw the mean to its middle, and where a
+            # traction counts from a least size on, the place jumps with each load that passes it.
+            weights = np.sum(traction.value(mu)[held] ** 2, axis=1) * areas
             positions = (model.nodes + model.displacement.value(mu))[held]
-            return most @ positions / max(float(most.sum()), 1e-300), np.zeros((d, 3))
+            return weights @ positions / max(float(weights.sum()), 1e-300), np.zeros((d, 3))
 
     elif name in model.supports:
         held = model.supports[name]
