@@ -150,7 +150,8 @@ class SystematicErrors:
         assert scale.with_state is not None
         unit = self._estimator.scale
         found = np.linalg.lstsq(self._factors / unit[:, None], scale.with_state / unit, rcond=LEAST_FACTOR)[0]
-        return np.asarray(found * min(1.0, scale.std / max(float(np.linalg.norm(found)), 1e-300)))
+        share = min(1.0, scale.std / max(float(np.linalg.norm(found)), 1e-300))
+        return np.asarray(found * share, dtype=np.float64)
 
     def _farther(self, part: BoundPart) -> Array:
         """By what share each error factor has the surface at the pixels of a part's points farther away (p, c)."""
