@@ -344,7 +344,7 @@ def test_inputs_that_do_not_fit_are_refused(recording, tmp_path):
     folder, _ = recording
     content = json.loads((folder / "registration.json").read_text())
     (tmp_path / "registration.json").write_text(
-        json.dumps(content | {"keyframes": [content["keyframes"][0] | {"frame": 1234}]})
+        json.dumps(content | {"frame": 1234, "keyframes": [content["keyframes"][0] | {"frame": 1234}]})
     )
     moved = {"registration": tmp_path / "registration.json"}
     with pytest.raises(MapError, match="it has no keyframe 1234"):

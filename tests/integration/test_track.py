@@ -100,7 +100,7 @@ def test_result_file_has_the_documented_layout(finished):
     }
     rows = ("frame", "timestamp", "status", "reason", "residual_rms_px", "unexplained_px", "n_points")
     rows += ("n_inliers", "largest_displacement", "largest_displacement_std", "pose_from")
-    rows += ("largest_von_mises", "largest_von_mises_std")
+    rows += ("largest_von_mises", "largest_von_mises_std", "motion_known")
     assert shapes == {**states, **dict.fromkeys(rows, (7,)), "timings_ms": (7, len(STAGES) + 1)}
 
 
