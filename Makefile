@@ -23,9 +23,8 @@ demo: $(INSTALLED)
 	@$(BIN)/python examples/demo/run.py
 
 # Each file of tests runs in one of two processes. What Python and numba compile for the tests is kept for all processes
-# that they begin, wherever Python is asked to write none; that of numba outlives `make clean`. Python keeps it beside the
-# modules: elsewhere it would not find what pip has compiled.
-COMPILED := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX= NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba
+# that they begin, wherever Python is asked to write none, and outlives `make clean`.
+COMPILED := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/numba
 PYTEST := $(COMPILED) $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 # A test that takes so many seconds hangs: it fails, and where each of its threads stands is printed.
 NONE_HANGS := -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true --max-worker-restart 1
