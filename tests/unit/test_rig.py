@@ -319,6 +319,13 @@ def assert_moved_as_stated(before, after, stated, scale):
     np.testing.assert_allclose(deviations, np.abs(away), atol=0.1 * np.linalg.norm(away))
 
 
+def assert_off_as_stated(off, stated, scale, share):
+    """Draws (n, 9) of how far an estimate is off have the covariance (9, 9) that is stated, but for a share of it."""
+    drawn, stated = np.cov((off / scale).T), stated / np.outer(scale, scale)
+    np.testing.assert_allclose(stated, drawn, atol=share * np.linalg.norm(drawn))
+    np.testing.assert_allclose(np.sqrt(np.diag(stated)), np.sqrt(np.diag(drawn)), rtol=0.2)
+
+
 @pytest.mark.parametrize("step", STEPS)
 def test_an_error_of_the_reference_moves_later_estimates_as_predicted(model, step):
     check_prediction(model, [(REFERENCE, moved(REFERENCE, step), step[:, None])])
@@ -365,10 +372,7 @@ def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_es
     errors = RigErrors(trackers, RIG, [CommonDepthScale(), CommonDepthScale(0.01)])
     plain = replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
-    scales = np.outer(estimator.scale, estimator.scale)
-    drawn = np.cov(off.T) / scales
-    np.testing.assert_allclose(stated / scales, drawn, atol=0.1 * np.linalg.norm(drawn))
-    np.testing.assert_allclose(np.sqrt(np.diag(stated / scales)), np.sqrt(np.diag(drawn)), rtol=0.2)
+    assert_off_as_stated(off, stated, estimator.scale, 0.1)
 
 
 def test_what_depths_leave_of_their_scale_goes_with_what_they_leave_of_the_reference_s_error(model):
@@ -399,10 +403,7 @@ def test_what_depths_leave_of_their_scale_goes_with_what_they_leave_of_the_refer
     errors = RigErrors(trackers, RIG, [CommonDepthScale(std)] * 2)
     plain = replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
-    scales = np.outer(estimator.scale, estimator.scale)
-    drawn = np.cov(off.T) / scales
-    np.testing.assert_allclose(stated / scales, drawn, atol=0.2 * np.linalg.norm(drawn))
-    np.testing.assert_allclose(np.sqrt(np.diag(stated / scales)), np.sqrt(np.diag(drawn)), rtol=0.2)
+    assert_off_as_stated(off, stated, estimator.scale, 0.2)
 
 
 def test_nothing_is_added_where_nothing_is_known(model):
