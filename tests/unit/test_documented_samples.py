@@ -56,7 +56,7 @@ def test_every_sample_file_is_read_by_a_test_here():
         ("registration", "csv"): 1,
         ("registration-aids", "csv"): 1,
         ("shell-study", "toml"): 2,
-        ("solid-study", "toml"): 9,
+        ("solid-study", "toml"): 10,
         ("study-file", "toml"): 1,
     }
 
@@ -175,6 +175,17 @@ def test_an_exported_run_in_the_coordinates_of_the_world(tmp_path, monkeypatch):
     np.testing.assert_allclose(found.points, run.camera_points(0), atol=1e-7)
 
 
+def test_study_of_a_solid():
+    """Its block is 60 mm high, and pulled by 20 mm."""
+    study = make_study(tomllib.loads(samples("solid-study", "toml")[0]))
+    assert isinstance(study, SolidStudy)
+    problem = study.problem()
+    mu = np.array([parameter.upper for parameter in study.model_parameters()])
+    moved = problem.nodal_displacement(advance(problem, problem.initial_state(), mu)[-1].dofs)
+    top = problem.mesh.nodes[:, 2] > 0.0599
+    np.testing.assert_allclose((problem.mesh.nodes + moved)[top, 2], 0.080, atol=1e-9)
+
+
 def test_values_of_a_solids_study():
     """Each line of the sample is read as what its key measures, with parameters of the kinds it tells."""
     parameters = tuple(
@@ -187,7 +198,7 @@ def test_values_of_a_solids_study():
         )
     )
     measured = {"young": "stress", "angle": "angle", "pressure": "pressure", "force": "force", "x": "length"}
-    values = tomllib.loads(samples("solid-study", "toml")[0])
+    values = tomllib.loads(samples("solid-study", "toml")[1])
     assert set(values) == set(measured)
     found = {
         key: [read_affine(text, measured[key], parameters) for text in np.atleast_1d(value).tolist()]
@@ -210,7 +221,7 @@ def test_sets_by_their_place():
         "loads": [{"kind": "pressure", "on": "pressed", "pressure": "p"}],
         "parameters": {"p": {"range": ["0 kPa", "1 kPa"]}},
     }
-    mesh = make_study(study | tomllib.loads(samples("solid-study", "toml")[1])).solid_mesh()
+    mesh = make_study(study | tomllib.loads(samples("solid-study", "toml")[2])).solid_mesh()
     assert mesh.nodes[mesh.set_nodes("base"), 2].max() == pytest.approx(0.031 / 6)
     spot = mesh.nodes[mesh.surface_nodes("pressed")]
     np.testing.assert_allclose(spot[:, 2], 0.031)
@@ -228,7 +239,7 @@ def test_the_wall_of_a_chamber_with_an_inlet(tmp_path):
         "supports": [{"kind": "fixed", "on": "x_max"}],
         "parameters": {"inflate": {"range": ["0 kPa", "10 kPa"]}},
     }
-    made = make_study(study | tomllib.loads(samples("solid-study", "toml")[2]))
+    made = make_study(study | tomllib.loads(samples("solid-study", "toml")[3]))
     assert isinstance(made, SolidStudy)
     area = 1e6 * surface_area(made.solid_mesh(), "chamber")
     wall = 2 * (12 * 9 + 12 * 11.5 + 9 * 11.5) - np.pi * 0.25
@@ -242,7 +253,7 @@ def test_a_strip_that_buckles_upwards_first():
         "materials": {"rubber": {"law": "neo_hookean", "young": "3 MPa", "poisson": 0.3}},
         "parameters": {"weight": {"range": ["0 Pa", "30 Pa"], "default": "20 Pa"}},
     }
-    sample = tomllib.loads(samples("solid-study", "toml")[3])
+    sample = tomllib.loads(samples("solid-study", "toml")[4])
     weight = {"kind": "traction", "on": "z_max", "traction": ["0 Pa", "0 Pa", "-1 * weight"]}
     supports, loads = [{"kind": "fixed", "on": "x_min"}, *sample["supports"]], [*sample["loads"], weight]
     sweep = make_study(study | {"supports": supports, "loads": loads}).sweep_problem()
@@ -258,7 +269,7 @@ def test_a_bar_with_a_fitting_at_its_end():
         "supports": [{"kind": "fixed", "on": "x_min"}],
         "parameters": {"pull": {"range": ["0 N", "0.1 N"]}, "bend": {"range": ["-5 N.mm", "5 N.mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[4])
+    study |= tomllib.loads(samples("solid-study", "toml")[5])
     sweep = make_study(study).sweep_problem()
     outputs = sweep.take_snapshot(sweep.advance(sweep.first_state(), np.array([0.05, 2e-3]))).outputs
     place = np.array([0.12, 0.0, 0.025]) + outputs["translation_x_max"]
@@ -276,7 +287,7 @@ def test_a_ball_that_presses_on_a_block():
         "supports": [{"kind": "fixed", "on": "z_min"}],
         "parameters": {"depth": {"range": ["0 mm", "8 mm"]}} | places,
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[5])
+    study |= tomllib.loads(samples("solid-study", "toml")[6])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert resolve_defaults(made).reduction.method == "pod"
@@ -290,7 +301,7 @@ def test_a_ball_that_presses_on_a_block():
 
 
 def test_a_stroke_that_grows_stays_and_goes_back():
-    section = tomllib.loads(samples("solid-study", "toml")[8])
+    section = tomllib.loads(samples("solid-study", "toml")[9])
     gel = {"law": "neo_hookean", "young": "1 MPa", "poisson": 0.3}
     parameters = {"time": {"range": ["0 s", "20 s"]}, "stroke": {"range": ["0 mm", "8 mm"]}}
     study = {
@@ -322,7 +333,7 @@ def test_shape_of_a_solid():
         "supports": [{"kind": "fixed", "on": "bottom"}],
         "parameters": {"growth": {"range": ["-0.5 mm", "1 mm"]}},
     }
-    study |= tomllib.loads(samples("solid-study", "toml")[6])
+    study |= tomllib.loads(samples("solid-study", "toml")[7])
     made = make_study(study)
     assert isinstance(made, SolidStudy)
     assert [shape.kind for shape in made.shape] == ["thickness"]
@@ -437,7 +448,7 @@ def test_evaluation_in_memory(tmp_path, monkeypatch):
 
 
 def test_unknown_loads():
-    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[7])["unknown_loads"])
+    section = UnknownLoadsSection(**tomllib.loads(samples("solid-study", "toml")[8])["unknown_loads"])
     assert (section.on, section.direction, section.modes) == ("top", "inward", 60)
 
 
