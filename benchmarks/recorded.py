@@ -152,11 +152,10 @@ BENCHMARKS = {
         SAME_MODEL,
         f"{NOISE}; the place of the plain seal in the map has no error but the map's",
         6,
-        "The plain seal is one grey; the printed one is also hidden by a disc, `hidden_share` of it. In these "
-        "runs an outline beside texture that is exact to a twentieth of a pixel counts for little: it neither spoils "
-        "nor helps. They are from before the outline [made good what the registration is off "
-        "by](how/uncertainty.md#from-the-reference-state). How a smooth surface's edge is placed was chosen with the "
-        "plain seal in sight.",
+        "The plain seal is one grey; the printed one is also hidden by a disc, `hidden_share` of it. Beside texture "
+        "that is exact to a twentieth of a pixel, the outline neither spoils nor helps in these runs, which are from "
+        "before it [corrected the registration](how/uncertainty.md#from-the-reference-state). How a smooth surface's "
+        "edge is placed was chosen with the plain seal in sight.",
     ),
     "cross_model": Benchmark(
         "Tracking",
@@ -167,15 +166,14 @@ BENCHMARKS = {
         f"{NOISE}; `disturbed`: also a rolling shutter, a lens and a focal length that are stated wrong, JPEG, "
         "changing exposure, and no readout time stated, with the camera that `morph slam` refines",
         7,
-        "`best_mm` is what is left where lever and side of the plain model are fitted to the true displacements; the "
+        "`best_mm` is the error of the plain model whose lever and side are fitted to the true displacements; the "
         "limits are 1.2 times that, and 0.4 mm with all disturbances, 0.15 mm without. `von_mises_percent` is the "
         "relative L2 error over the volume, `best_von_mises_percent` that of the best fit. `pose_mm` and "
-        "`parameters_mm` say how far the errors of pose and parameters alone move the points. What is missing: "
-        "`best_mm` and the stress of the best fit are errors of the plain model (mesh, law, axis); they are not "
-        "estimated, and no stated deviation contains them. That a refined camera keeps a principal point which is not "
-        "refuted was decided with seed 61 in sight, the size of the patches by which points are "
-        "measured again with seeds 61 to 63. The refined camera of a scene depends on rounding: seed 61 "
-        "disturbed has had 0.31 to 0.54 mm with the same code.",
+        "`parameters_mm` say how far the errors of pose and parameters alone move the points. `best_mm` and the stress "
+        "of the best fit are errors of the plain model (mesh, law, axis), which no stated deviation contains. Chosen "
+        "with seed 61 in sight: that a refined camera keeps a principal point which is not refuted; with seeds 61 to "
+        "63: the size of the patches by which points are measured again. The refined camera depends on rounding: seed "
+        "61 disturbed has had 0.31 to 0.54 mm with the same code.",
     ),
     "paper_sheet_track": Benchmark(
         "Tracking",
@@ -264,8 +262,8 @@ BENCHMARKS = {
         "python benchmarks/rendered_desks.py --metric 1 --hints clicks",
         "simulated: exact pose; right is within 5 mm and 3 degrees",
         "scales of the maps off by 1 % (one standard deviation), clicks of 1 px, a trembling hand, a rolling shutter",
-        about="Maps as of a depth camera or a stereo pair. Of two ways to count what is known of the scale, about "
-        "equally good, one was chosen with these desks in sight.",
+        about="Maps as of a depth camera or a stereo pair. Of two priors of the scale, about equally good, one was "
+        "chosen with these desks in sight.",
     ),
     "figurines": Benchmark(
         "Registration",
@@ -344,9 +342,9 @@ BENCHMARKS = {
         "finite elements with another mesh and law, with contact",
         "0.3 px on points, 0.1 mrad and 0.05 mm on the pose",
         10,
-        "The figures without prefix are those where the ball hides what is behind it. How many loads, and the "
-        "constants of what is known beforehand, were chosen at two other places, with the errors there in sight. At "
-        "the third place errors are larger than stated, most with 40 % of the surface hidden.",
+        "The figures without prefix are those where the ball hides what is behind it. The number of loads and the "
+        "constants of their prior were chosen at two other places, with the errors there in sight. At the third place "
+        "errors are larger than stated, most with 40 % of the surface hidden.",
     ),
     "discretisation": Benchmark(
         "Mechanics",
@@ -354,8 +352,8 @@ BENCHMARKS = {
         "python benchmarks/discretisation.py",
         "hex27 cells on a mesh that is finer; of the last four lines, elements of third order solved to the end",
         lines=16,
-        about="`load` is the error of the push that its displacement is taken for, stated over true; the true one is "
-        "positive where elements are too stiff.",
+        about="`displacement` and `load` are stated over true errors: `load` of the push that has the same "
+        "displacement. Its true error is positive where elements are too stiff.",
     ),
     "elements": Benchmark(
         "Mechanics",
