@@ -105,4 +105,4 @@ def test_an_interval_beside_an_end_of_a_range_is_said_not_to_hold(a: float, held
     measured += NOISE * rng.normal(size=measured.shape)
     table = MeasuredPoints(model, states, {"load": load}, places, measured)
     text = said(identify(model, [table], ["a", "b"]))
-    assert ("b made good what a, at the end of its range, could not: its interval does not hold" in text) is held
+    assert ("b compensated for a, which is at the end of its range: its interval does not hold" in text) is held

@@ -174,7 +174,7 @@ def _held_by_ends(figures: Mapping[str, Any]) -> list[str]:
         row = figures["correlation"][end]
         if moved := [name for name in at_end if not at_end[name] and abs(row[name]) > RELATED]:
             said.append(
-                f"note: {' and '.join(moved)} made good what {end}, at the end of its range, could not: "
+                f"note: {' and '.join(moved)} compensated for {end}, which is at the end of its range: "
                 f"{'its interval does' if len(moved) == 1 else 'their intervals do'} not hold"
             )
     return said

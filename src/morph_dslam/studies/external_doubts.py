@@ -21,7 +21,7 @@ Indices = NDArray[np.int64]
 #: A state is far off if the others miss it by so many times their own error, and by this share of the largest value.
 TIMES, SHARE = 20.0, 0.05
 #: Beyond the others a smooth field may rise steeply. There only a value so many times theirs is far off, and one that
-#: is zero where they make expect this share of their largest.
+#: is zero where they predict this share of their largest.
 TIMES_BEYOND, SHARE_ZERO = 100.0, 0.4
 #: Least error that can be distinguished from rounding, over the largest value.
 ROUNDING = 1e-8
@@ -191,11 +191,11 @@ def _far_off(name: str, off: FarOff) -> str:
     missed = f"{100.0 * off.missed:.2g} % of" if off.missed < 1.0 else f"{_short(off.missed)} times"
     if off.zero:
         return (
-            f"the {name} is zero everywhere, where the other solutions make expect {missed} the largest: leave the "
+            f"the {name} is zero everywhere, where the other solutions predict {missed} the largest: leave the "
             "row out if the solution failed"
         )
     return (
-        f"the {name} is off by {missed} the largest from what the other solutions make expect, {_short(off.times)} "
+        f"the {name} is off by {missed} the largest from what the other solutions predict, {_short(off.times)} "
         "times their usual error: check its parameters, its units and the order of its nodes"
     )
 
