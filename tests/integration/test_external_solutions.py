@@ -135,6 +135,6 @@ def test_a_damaged_solution_is_one_message(folder, refused):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert re.search(
-        r"^morph: \S*study.toml: cannot read the solution .*run3\.vtu",
+        r"^morph: \S*study.toml: .*run3\.vtu is damaged, cut short, or no \.vtu file",
         refused("build", folder / "study.toml", "-o", folder / "x.morph"),
     )

@@ -2,6 +2,7 @@
 
 import base64
 import re
+from pathlib import Path
 
 import meshio
 import numpy as np
@@ -110,33 +111,108 @@ def test_voxels_are_refused_and_polylines_left_out_at_every_width_of_the_termina
     assert not any(capfd.readouterr())
 
 
-@pytest.mark.parametrize(
-    ("version", "number", "said"),
-    [
-        ("3.0", 4, "holds polylines, which cannot be read: save lines"),
-        ("3.0", 8, "holds pixels, which cannot be read: save quadrilaterals"),
-        ("5.1", 8, "holds pixels, which cannot be read: save quadrilaterals"),
-        ("3.0", 11, "holds voxels, which cannot be read: save hexahedra"),
-        ("3.0", 99, "holds cells of VTK's type 99, which cannot be read"),
-    ],
-)
-def test_cells_that_end_meshio_in_an_error_are_named(tmp_path, version, number, said):
-    """Beside a hexahedron, in VTK's legacy format."""
-    path, corners = tmp_path / "solution.vtk", 8 if number == 11 else 4
+def write_legacy(path, version, *others):
+    """A hexahedron and ``others``, (VTK's type, number of nodes) of each, in VTK's legacy format."""
+    nodes, types = [8, *(count for _, count in others)], [12, *(number for number, _ in others)]
     points = "\n".join(f"{x} {y} {z}" for z in (0, 1) for y in (0, 1) for x in (0, 1))
-    solid, other = "0 1 3 2 4 5 7 6", " ".join(map(str, range(corners)))
-    cells = f"CELLS 2 {10 + corners}\n8 {solid}\n{corners} {other}"
+    lists = ["0 1 3 2 4 5 7 6", *(" ".join(str(k % 8) for k in range(count)) for count in nodes[1:])]
+    cells = f"CELLS {len(nodes)} {sum(nodes) + len(nodes)}\n"
+    cells += "\n".join(f"{count} {each}" for count, each in zip(nodes, lists, strict=True))
     if version == "5.1":
-        offsets = f"OFFSETS vtktypeint64\n0 8 {8 + corners}"
-        cells = f"CELLS 3 {8 + corners}\n{offsets}\nCONNECTIVITY vtktypeint64\n{solid} {other}"
+        offsets = " ".join(map(str, np.cumsum([0, *nodes])))
+        cells = f"CELLS {len(nodes) + 1} {sum(nodes)}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtktypeint64\n"
+        cells += " ".join(lists)
     path.write_text(
         f"# vtk DataFile Version {version}\nname\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 8 double\n{points}\n"
-        f"{cells}\nCELL_TYPES 2\n12\n{number}\n"
+        f"{cells}\nCELL_TYPES {len(types)}\n" + "\n".join(map(str, types)) + "\n"
     )
-    with pytest.raises(StudyError, match=said):
+
+
+def refusals(path):
+    """What is said of a file as a solution and as a mesh."""
+    with pytest.raises(StudyError) as of_solution:
         read_solution(path)
-    with pytest.raises(StudyError, match=said):
+    with pytest.raises(StudyError) as of_mesh:
         load_mesh(path, "mm")
+    return str(of_solution.value), str(of_mesh.value)
+
+
+@pytest.mark.parametrize(
+    ("version", "other", "said"),
+    [
+        ("3.0", (4, 4), "holds polylines, which cannot be read: save lines"),
+        ("3.0", (8, 4), "holds pixels, which cannot be read: save quadrilaterals"),
+        ("5.1", (8, 4), "holds pixels, which cannot be read: save quadrilaterals"),
+        ("3.0", (11, 8), "holds voxels, which cannot be read: save hexahedra"),
+        ("3.0", (99, 4), "holds cells of VTK's type 99, which cannot be read"),
+        ("3.0", (24, 8), "its cells have other numbers of nodes than cells of their types"),
+    ],
+)
+def test_cells_that_end_meshio_in_an_error_are_named(tmp_path, version, other, said):
+    write_legacy(tmp_path / "solution.vtk", version, other)
+    for refusal in refusals(tmp_path / "solution.vtk"):
+        assert said in refusal
+
+
+@pytest.mark.parametrize("harmless", [(4, 3), (7, 4)], ids=["polyline", "polygon"])
+def test_cells_that_may_be_there_are_not_blamed_for_what_is_cut_short(tmp_path, harmless):
+    path = tmp_path / "solution.vtk"
+    write_legacy(path, "5.1", harmless)
+    assert read_solution(path).cells[0].type == "hexahedron"
+    path.write_text(path.read_text() + "POINT_DATA 8\nVECTORS u double\n1 2 3\n4 5\n")
+    for refusal in refusals(path):
+        assert "is damaged, cut short" in refusal
+
+
+def write_vtu(path, cells, pieces=1):
+    """Cells, (VTK's type, nodes) of each, of the corners of a unit cube, the same in each piece."""
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
+    nodes = [each for _, each in cells]
+    arrays = [("connectivity", [k for each in nodes for k in each]), ("offsets", np.cumsum([len(n) for n in nodes]))]
+    arrays += [("types", [number for number, _ in cells])]
+
+    def array(name, values, components=1):
+        text = " ".join(map(str, np.ravel(values).astype(int).tolist()))
+        kind = "Float64" if components == 3 else "Int64"
+        return f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}">{text}</DataArray>'
+
+    piece = f'<Piece NumberOfPoints="8" NumberOfCells="{len(cells)}"><Points>{array("p", corners, 3)}</Points><Cells>'
+    piece += "".join(array(*each) for each in arrays) + "</Cells></Piece>"
+    path.write_text(
+        '<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian"><UnstructuredGrid>'
+        f"{pieces * piece}</UnstructuredGrid></VTKFile>"
+    )
+
+
+CUBE = [0, 1, 3, 2, 4, 5, 7, 6]
+
+
+@pytest.mark.parametrize(
+    ("cells", "pieces", "said"),
+    [
+        ([(12, CUBE), (4, [0, 1, 3]), (11, range(8))], 1, "holds voxels, which cannot be read: save hexahedra in"),
+        ([(12, CUBE), (42, range(8))], 1, "holds polyhedra, which cannot be read: save tetrahedra in"),
+        ([(12, CUBE), (30, range(6))], 1, "holds quadrilaterals of 6 nodes, which cannot be read"),
+        ([(12, CUBE), (34, range(7))], 1, "holds triangles of 7 nodes, which cannot be read"),
+        ([(4, [0, 1, 3])], 1, "holds polylines, which cannot be read: save lines in"),
+        ([], 1, "holds no cells: save the mesh with its cells"),
+        ([(12, CUBE)], 2, "holds several pieces, of which only the last is read: merge them"),
+    ],
+)
+def test_only_what_is_wrong_with_a_vtu_file_is_named(tmp_path, cells, pieces, said):
+    write_vtu(tmp_path / "solution.vtu", cells, pieces)
+    for refusal in refusals(tmp_path / "solution.vtu"):
+        assert said in refusal
+
+
+def test_a_step_that_a_series_lacks_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with meshio.xdmf.TimeSeriesWriter("s.xdmf") as series:
+        series.write_points_cells(np.eye(4)[:, :3], [("tetra", np.arange(4)[None])])
+        series.write_data(0.0, point_data={"u": np.ones((4, 3))})
+    assert read_solution(Path("s.xdmf"), "0").point_data["u"] == pytest.approx(np.ones((4, 3)))
+    with pytest.raises(StudyError, match="has no step 1: its steps are 0 to 0"):
+        read_solution(Path("s.xdmf"), "1")
 
 
 def test_prisms_of_15_nodes_in_xdmf_are_named(tmp_path):

@@ -280,7 +280,7 @@ def test_a_file_beside_a_solution_that_keeps_nothing_there_is_no_input(with_inpu
     for own in ("solutions/1.vtu", "solutions/1.h5"):
         Path(own).write_text("mine")
     Path("table.csv").write_text("file,force [N]\n" + "".join(f"solutions/{k}.vtu,{k}\n" for k in (1, 2, 3, 4, 5, 6)))
-    assert "cannot read the solution solutions/1.vtu" in refused("build", "study.toml", "-o", "solutions/1.h5")
+    assert "solutions/1.vtu is damaged" in refused("build", "study.toml", "-o", "solutions/1.h5")
 
 
 POSE = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 620]\n"

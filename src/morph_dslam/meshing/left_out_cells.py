@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from contextlib import redirect_stderr, suppress
-from io import StringIO
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -33,49 +32,94 @@ _INSTEAD = {
     8: ("pixels", "quadrilaterals"),
     11: ("voxels", "hexahedra"),
     26: ("prisms of 15 nodes", "prisms of 18 or 6"),
+    30: ("quadrilaterals of 6 nodes", "quadrilaterals of 8 or 4"),
+    34: ("triangles of 7 nodes", "triangles of 6 or 3"),
     42: ("polyhedra", "tetrahedra"),
 }
 
 
-def leaves_out_cells(path: Path, content: meshio.Mesh) -> bool:
-    """Whether a file has cells that its ``content`` lacks, other than of a lower dimension than the highest in it.
+def left_out_cells(path: Path, content: meshio.Mesh) -> str | None:
+    """For messages, which cells a file has that its ``content`` lacks, and what to save in their place.
 
-    Of files that are not .vtu or .vtk it has all: meshio refuses what it does not know.
+    Those of a lower dimension than the highest in it do not count. Of files that are not .vtu or .vtk it has all:
+    meshio refuses what it does not know.
+
+    Returns
+    -------
+    None if it lacks none.
     """
-    pattern = _STATED.get(file_kind(path))
-    if pattern is None:
-        return False
-    stated = [int(number) for number in pattern.findall(path.read_bytes())]
+    stated = _stated(path)
     lacking = sum(stated) - sum(len(block) for block in content.cells)
     if not stated or not lacking:
-        return False
+        return None
     types = _types(path)
     highest = max((block.dim for block in content.cells), default=0)
     lower = [number for number, dimension in _DIMENSIONS.items() if dimension < highest]
-    return lacking > np.isin(types, lower).sum()
+    if lacking <= np.isin(types, lower).sum():
+        return None
+    if unknown := np.setdiff1d(types, [*vtk_to_meshio_type, *lower]).tolist():
+        return _named(unknown)
+    return (
+        "several pieces, of which only the last is read: merge them" if len(stated) > 1 else "cells that are not known"
+    )
 
 
-def unread_cells(path: Path, error: Exception | None = None) -> str | None:
-    """For messages, which cells a file holds that meshio knows no number of nodes of, and what to save in their place.
+def why_unread(path: Path, error: Exception) -> str:
+    """What is wrong with a file that meshio refused, and how to mend it: for messages, after the file's name.
 
     Parameters
     ----------
     path : of the file.
-    error : that meshio ended in, if it did.
-
-    Returns
-    -------
-    None if there are none, or the file is too damaged to tell.
+    error : that meshio ended in.
     """
     numbers: list[int] = []
+    reason = f"{type(error).__name__}: {error}".removesuffix(": ")
     if isinstance(error, KeyError):  # the name of such a cell
         numbers += [meshio_to_vtk_type[name] for name in error.args if name in meshio_to_vtk_type]
-    if file_kind(path) in _STATED:
+    if stated := _stated(path):
+        if not sum(stated):
+            return "holds no cells: save the mesh with its cells"
         with suppress(Exception):  # meshio raises whatever its parsers meet
-            known = [k for k, name in vtk_to_meshio_type.items() if name in num_nodes_per_cell]
-            numbers += np.setdiff1d(_types(path), known).tolist()
-    if not numbers:
-        return None
+            types = _types(path)
+            numbers += [number for number in np.unique(types).tolist() if _ends_reading(number, path)]
+            if not numbers and _other_sizes(path, types):
+                reason = "its cells have other numbers of nodes than cells of their types"
+    if numbers:
+        return f"holds {_named(numbers)}"
+    return f"is damaged, cut short, or no {file_kind(path)} file ({reason})"
+
+
+def _stated(path: Path) -> list[int]:
+    """How many cells a .vtu or .vtk file states that it has, for each place where it does."""
+    pattern = _STATED.get(file_kind(path))
+    return [] if pattern is None else [int(number) for number in pattern.findall(path.read_bytes())]
+
+
+def _is_old(path: Path) -> bool:
+    """Whether a file is of VTK's legacy format in a version that lists each cell with its number of nodes."""
+    return file_kind(path) == ".vtk" and b"\nOFFSETS " not in path.read_bytes()
+
+
+def _ends_reading(number: int, path: Path) -> bool:
+    """Whether meshio refuses a file for cells of a type, by VTK's number, rather than read them or leave them out."""
+    name = vtk_to_meshio_type.get(number)
+    if name is None:
+        return _is_old(path)
+    # Of polygons and Lagrange cells the newer formats tell each one's number of nodes.
+    is_told = name == "polygon" or (name.startswith("VTK_LAGRANGE") and not _is_old(path))
+    return name not in num_nodes_per_cell and not is_told
+
+
+def _other_sizes(path: Path, types: NDArray[np.int64]) -> bool:
+    """Whether an old legacy file states another number of nodes than cells of its ``types`` (n,) have."""
+    found = re.search(rb"^CELLS[ \t]+\d+[ \t]+(\d+)", path.read_bytes(), re.MULTILINE)
+    if found is None or not _is_old(path):
+        return False
+    return int(found[1]) != sum(1 + num_nodes_per_cell[vtk_to_meshio_type[number]] for number in types.tolist())
+
+
+def _named(numbers: list[int]) -> str:
+    """Cells by VTK's numbers of their types, and what to save in their place."""
     named = [_INSTEAD.get(number, (f"cells of VTK's type {number}", "linear ones")) for number in numbers]
     cells, instead = (" and ".join(dict.fromkeys(words)) for words in zip(*named, strict=True))
     return f"{cells}, which cannot be read: save {instead} in their place"
@@ -93,8 +137,9 @@ def _types_of_vtu(path: Path) -> NDArray[np.int64]:
     except ElementTree.ParseError:  # data appended as they are in memory
         root = _vtu._parse_raw_binary(str(path))
     arrays = root.iterfind("UnstructuredGrid/Piece/Cells/DataArray[@Name='types']")
-    with redirect_stderr(StringIO()):  # it warns once more
-        reader = _vtu.VtuReader(str(path))
+    reader = _vtu.VtuReader.__new__(_vtu.VtuReader)  # its constructor reads all of the file, and may refuse it
+    reader.compression, reader.byte_order = root.get("compressor"), root.get("byte_order")
+    reader.header_type, reader.appended_data = root.get("header_type", "UInt32"), _vtu.get_grid(root)[1]
     return np.concatenate([np.asarray(reader.read_data(array)).ravel() for array in arrays]).astype(np.int64)
 
 

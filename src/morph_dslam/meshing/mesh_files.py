@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import MESHES, file_kind
 from morph_dslam.io.inp_file import InpFile, SurfacePart, read_inp
-from morph_dslam.meshing.left_out_cells import leaves_out_cells, unread_cells
+from morph_dslam.meshing.left_out_cells import left_out_cells, why_unread
 from morph_dslam.meshing.mesh_checks import check_corners
 from morph_dslam.meshing.mesh_repair import reoriented, without_collapsed_cells
 from morph_dslam.meshing.meshes import CellBlock, Mesh, find_faces, with_found_surfaces
@@ -218,7 +218,7 @@ def _read(path: Path) -> Any:
             _check_gmsh(path)
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
             content = readers[kind](str(path))
-        lacks_cells = leaves_out_cells(path, content)
+        left_out = left_out_cells(path, content)
     except OSError as error:
         raise StudyError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except StudyError:
@@ -236,21 +236,18 @@ def _read(path: Path) -> Any:
         raise _damaged(path, error) from error
     except Exception as error:  # a damaged file ends meshio's readers in errors of every kind
         raise _damaged(path, error) from error
-    if lacks_cells:  # voxels, say
-        known = f"cells that are not known; use {', '.join(_CELLS)}"
-        raise StudyError(f"{path} holds {unread_cells(path) or known}")
+    if left_out:  # voxels, say
+        raise StudyError(f"{path} holds {left_out}")
     return content
 
 
 def _damaged(path: Path, error: Exception) -> StudyError:
-    if unread := unread_cells(path, error):
-        return StudyError(f"{path} holds {unread}")
     if file_kind(path) == ".msh" and path.read_bytes()[:1] == b"(":
         return StudyError(
             f"{path} is an ANSYS mesh file, which ends in .msh too: save it as Gmsh's, from meshio with "
             'file_format="gmsh" or "gmsh22"'
         )
-    return StudyError(f"{path} is damaged, cut short, or no {file_kind(path)} file ({type(error).__name__}: {error})")
+    return StudyError(f"{path} {why_unread(path, error)}")
 
 
 def _check_gmsh(path: Path) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import StudyError
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.meshing.left_out_cells import leaves_out_cells, unread_cells
+from morph_dslam.meshing.left_out_cells import left_out_cells, why_unread
 
 Array = NDArray[np.float64]
 #: Of meshio, by what the file is: `meshio.read` itself ends the program where a file is damaged.
@@ -25,9 +25,9 @@ SAME = 1e-5
 def read_solution(path: Path, step: str | None = None, whole: bool = True) -> meshio.Mesh:
     """A file's mesh and point data; of an XDMF series those of one step.
 
-    Raises StudyError if it is missing, damaged or of another kind, the step is no number from 0 on, or, where it must
-    be ``whole``, it has cells that meshio does not know and leaves out, such as voxels; polylines beside solids may be,
-    save in legacy VTK files older than version 5.1, which meshio refuses then.
+    Raises StudyError if it is missing, damaged or of another kind, it has no such step, or, where it must be ``whole``,
+    it has cells that meshio does not know and leaves out, such as voxels; polylines beside solids may be, save in
+    legacy VTK files older than version 5.1, which meshio refuses then.
     """
     if step is not None and not step.isdecimal():
         raise StudyError(f"step '{step}' of {path} is no whole number from 0 on")
@@ -38,19 +38,21 @@ def read_solution(path: Path, step: str | None = None, whole: bool = True) -> me
         if step is None:
             with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
                 content = read(str(path))
-            if whole and leaves_out_cells(path, content):
-                raise StudyError(f"{path} holds {unread_cells(path) or 'cells that are not known'}")
+            if whole and (left_out := left_out_cells(path, content)):
+                raise StudyError(f"{path} holds {left_out}")
             return content
         with meshio.xdmf.TimeSeriesReader(path) as reader:
+            if int(step) >= reader.num_steps:
+                raise StudyError(f"{path} has no step {step}: its steps are 0 to {reader.num_steps - 1}")
             points, cells = reader.read_points_cells()
             _, point_data, _ = reader.read_data(int(step))
             return meshio.Mesh(np.asarray(points), cells, point_data=point_data)
     except StudyError:
         raise
+    except OSError as error:
+        raise StudyError(f"cannot read the solution {path}: {error.strerror or error}") from error
     except Exception as error:  # meshio raises whatever its parsers meet
-        if unread := unread_cells(path, error):
-            raise StudyError(f"{path} holds {unread}") from error
-        raise StudyError(f"cannot read the solution {path}: {error}") from error
+        raise StudyError(f"{path} {why_unread(path, error)}") from error
 
 
 def points_in_space(content: meshio.Mesh) -> Array:
