@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from morph_dslam.cli.app import main
+from morph_dslam.mechanics.materials import base
 from morph_dslam.mechanics.materials.base import registered_laws
+from morph_dslam.mechanics.materials.library import laws
 from morph_dslam.studies.executors import default_executor
 from tests.support.block_study import write_study
 
@@ -73,12 +76,20 @@ def test_workers_know_the_laws_of_files_that_a_script_imports(tmp_path: Path) ->
     assert ended.returncode == 0, ended.stderr
 
 
-def test_a_worker_knows_a_law_that_this_process_has_imported(tmp_path: Path, monkeypatch) -> None:
+@pytest.fixture
+def quick_law(tmp_path: Path) -> Iterator[type]:
+    """A law of an imported file; what is registered and imported is as before afterwards."""
     (tmp_path / "quick_law.py").write_text(LAW.replace("softened", "quickly softened"))
-    monkeypatch.syspath_prepend(tmp_path)
-    law = import_module("quick_law").Softened
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(base, "_LAWS", dict(laws()))
+        patch.syspath_prepend(tmp_path)
+        yield import_module("quick_law").Softened
+    del sys.modules["quick_law"]
+
+
+def test_a_worker_knows_a_law_that_this_process_has_imported(quick_law: type) -> None:
     with default_executor(2) as executor:
-        assert executor.submit(registered_laws).result()["quickly softened"] is law
+        assert executor.submit(registered_laws).result()["quickly softened"] is quick_law
 
 
 @pytest.mark.slow
