@@ -8,6 +8,7 @@ import pytest
 
 from morph_dslam.errors import TrackingError
 from morph_dslam.geometry import RigidTransform
+from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.model import Parameter
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
@@ -19,7 +20,8 @@ from morph_dslam.tracking.run_options import TrackOptions
 from morph_dslam.tracking.tracker import CameraLocalization, Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
-from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state
+from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state, write_recording
+from tests.support.tracked_rig import placed_objects
 
 POSE = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
 SHEET = bent_sheet_model(22, 16)
@@ -100,3 +102,26 @@ def test_a_hidden_object_is_told_of_the_time_too():
     result = tracker.track(Frame(1, 3.0, film.blank()), CameraLocalization(place))
     assert result.status is Status.HIDDEN
     assert result.warnings == (TimeOutside("hold", "-7 s", "0 to 20 s", is_before=True),)
+
+
+def test_the_time_of_the_reference_frame_counts_in_the_registration(tmp_path):
+    """Nine landmarks, a pixel off, leave the time open; it is known to a thousandth of its range of 1.2 s."""
+    hold = replace(TIME, lower=SHEET.lower[1], upper=SHEET.upper[1])  # as the file scales the field by it
+    model = replace(MODEL, parameters=(MODEL.parameters[0], hold, MODEL.parameters[2]))
+    state, rng = sheet_state(0.2), np.random.default_rng(5)
+    write_recording(tmp_path, {4: SheetFilm(SHEET).frame(state)}, model)
+    nodes = rng.choice(len(model.nodes), 9, replace=False)
+    pixels = CAMERA.project(state.camera_from_object.apply(SHEET.positions(state.parameters)[nodes]))
+    save_landmarks(tmp_path / "landmarks.csv", Landmarks(model.nodes[nodes], pixels + rng.standard_normal((9, 2))))
+    (placed,) = placed_objects(
+        frames=tmp_path / "frames",
+        camera=tmp_path / "camera.yaml",
+        model=tmp_path / "sheet.morph",
+        landmarks=tmp_path / "landmarks.csv",
+        fps=10.0,
+        time_zero=4 / 10.0 - state.parameters[1],
+    )
+    by_landmarks = placed.registration
+    assert np.sqrt(by_landmarks.covariance[1, 1]) > 10.0 * 1.2e-3
+    assert abs(by_landmarks.state.parameters[1] - state.parameters[1]) > 10.0 * 1.2e-3
+    assert placed.new_tracker().state.parameters[1] == pytest.approx(state.parameters[1], abs=3.0 * 1.2e-3)

@@ -12,7 +12,7 @@ from morph_dslam.geometry import RigidTransform, rotation_exp, rotation_log
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking.estimator import EstimationOptions, Estimator, State
-from morph_dslam.tracking.known_values import KnownValues, registered_with
+from morph_dslam.tracking.known_values import KnownParameters, KnownValues, registered_with
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points, measured
 from tests.support.rendered_sequence import CAMERA, UPRIGHT, SheetFilm, sheet_state, write_recording
@@ -162,8 +162,10 @@ def test_a_registration_takes_in_what_is_known_in_its_frame():
     root = scale[:, None] * (np.eye(9) + 0.4 * np.random.default_rng(3).standard_normal((9, 9)))
     covariance, information = root @ root.T, np.zeros((9, 9))
     information[2, 2], information[0, 0] = 1.0 / 0.001**2, 1.0 / 0.0005**2
-    known = KnownValues(np.array([2, 0]), {7: np.array([[0.052, 0.001], [0.031, 0.0005]])})
-    found = registered_with(Registration(MODEL, TRUTH, covariance), known, 7)
+    known = KnownParameters(MODEL)
+    known.values = KnownValues(np.array([2, 0]), {7: np.array([[0.052, 0.001], [0.031, 0.0005]])})
+    known.begin(7)
+    found = registered_with(Registration(MODEL, TRUTH, covariance), known)
     expected = np.linalg.inv(np.linalg.inv(covariance) + information)
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-6, atol=1e-12)
     step = expected @ information @ [0.001, 0.0, 0.002, *[0.0] * 6]
@@ -171,7 +173,8 @@ def test_a_registration_takes_in_what_is_known_in_its_frame():
     turn = rotation_log(found.state.camera_from_object.rotation @ POSE.rotation.T)
     assert turn == pytest.approx(step[3:6], abs=1e-12)
     assert found.state.camera_from_object.translation == pytest.approx(POSE.translation + step[6:], abs=1e-12)
-    assert registered_with(Registration(MODEL, TRUTH, covariance), known, 8).state is TRUTH
+    known.begin(8)
+    assert registered_with(Registration(MODEL, TRUTH, covariance), known).state is TRUTH
 
 
 def test_values_of_no_tracked_frame_are_named(tmp_path):

@@ -244,32 +244,6 @@ class KnownTime:
         return time, min(0.5 * interval, most) if interval > 0.0 else most
 
 
-def registered_with(registration: Registration, known: KnownValues, frame: int) -> Registration:
-    """The registration with what is known of parameters in its frame, to first order.
-
-    What it is off by stays in all frames, by the places of the points on the mesh: where a sensor tells the shape
-    better, later estimates of the same parameters would be worse than the sensor's.
-
-    Parameters
-    ----------
-    registration : itself is returned where its covariance is not known.
-    known : of a recording.
-    frame : number of the reference frame in it.
-    """
-    covariance, values = registration.covariance, known.by_frame.get(frame)
-    if covariance is None or values is None or not np.isfinite(covariance).all():
-        return registration
-    there = np.isfinite(values[:, 0])
-    rows, (told, deviations) = known.indices[there], values[there].T
-    state, model = registration.state, registration.model
-    gain = np.linalg.solve(covariance[np.ix_(rows, rows)] + np.diag(deviations**2), covariance[rows]).T
-    step = gain @ (told - state.parameters[rows])
-    found = moved(state, step)
-    found = replace(found, parameters=np.clip(found.parameters, model.lower, model.upper))
-    left = covariance - gain @ covariance[rows]
-    return replace(registration, state=found, covariance=0.5 * (left + left.T))
-
-
 class KnownParameters:
     """The term of the cost from what is known of parameters in the present frame.
 
@@ -372,6 +346,30 @@ class KnownParameters:
         information = self.squared_px / self.now[:, 1] ** 2
         away = parameters[self.indices] - self.now[:, 0]
         return 0.5 * float(information @ away**2), information, information * away
+
+
+def registered_with(registration: Registration, known: KnownParameters) -> Registration:
+    """The registration with what is known of parameters in its frame, to first order.
+
+    What it is off by stays in all frames, by the places of the points on the mesh: where a sensor tells the shape
+    better, later estimates of the same parameters would be worse than the sensor's.
+
+    Parameters
+    ----------
+    registration : itself is returned where its covariance is not known.
+    known : in the reference frame.
+    """
+    covariance, rows = registration.covariance, known.indices
+    if covariance is None or not len(rows) or not np.isfinite(covariance).all():
+        return registration
+    told, deviations = known.now.T
+    state, model = registration.state, registration.model
+    gain = np.linalg.solve(covariance[np.ix_(rows, rows)] + np.diag(deviations**2), covariance[rows]).T
+    step = gain @ (told - state.parameters[rows])
+    found = moved(state, step)
+    found = replace(found, parameters=np.clip(found.parameters, model.lower, model.upper))
+    left = covariance - gain @ covariance[rows]
+    return replace(registration, state=found, covariance=0.5 * (left + left.T))
 
 
 def _told(name: str, value: object) -> tuple[float, float]:

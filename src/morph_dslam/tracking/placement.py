@@ -22,7 +22,7 @@ from morph_dslam.tracking.anchoring import Anchor
 from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimator, State
 from morph_dslam.tracking.hypothesis import Image
-from morph_dslam.tracking.known_values import KnownTime, registered_with
+from morph_dslam.tracking.known_values import KnownParameters, KnownTime, registered_with
 from morph_dslam.tracking.multi_camera import RigTracker
 from morph_dslam.tracking.occlusion import drawn_depth
 from morph_dslam.tracking.options import TrackerOptions
@@ -58,6 +58,7 @@ class PlacedObject:
     keyframes : by camera, other images of the object as it is there; None where only the reference is known.
     depth : (h, w) of the first camera's reference frame in the scale that the registration found, metres, NaN where
         unknown; None where it does not count.
+    timestamp : of the reference frame, seconds; None where the recording that is tracked does not tell it.
     """
 
     object: TrackedObject
@@ -69,6 +70,7 @@ class PlacedObject:
     seen: tuple[NDArray[np.bool_] | None, ...] = ()
     keyframes: tuple[KeyframeViews, ...] | None = None
     depth: NDArray[np.float32] | None = None
+    timestamp: float | None = None
 
     @property
     def name(self) -> str:
@@ -129,9 +131,12 @@ class PlacedObject:
     def new_tracker(self) -> Tracker | RigTracker:
         """A tracker at its beginning; raises RegistrationError if the object shows too few corners."""
         seen = self.seen or (None,) * len(self.cameras)
-        registration, told = self.registration, self.object.known
-        if told is not None and not self.is_by_keyframe:  # a keyframe may be of another recording than the table
-            registration = registered_with(registration, told, self.frame)
+        registration = self.registration
+        if not self.is_by_keyframe:  # a keyframe may be of another recording
+            known = KnownParameters(self.model)
+            self._tell_all_frames(known)
+            known.begin(self.frame, self.timestamp)
+            registration = registered_with(registration, known)
         if len(self.cameras) > 1:
             tracker = RigTracker(
                 self.model,
@@ -154,9 +159,13 @@ class PlacedObject:
                 seen=seen[0],
                 keyframes=None if self.keyframes is None else self.keyframes[0],
             )
-        known, zero = tracker.estimator.known, self.object.time_zero
-        known.values, known.clock = self.object.known, None if zero is None else KnownTime.of(tracker.model, zero)
+        self._tell_all_frames(tracker.estimator.known)
         return tracker
+
+    def _tell_all_frames(self, known: KnownParameters) -> None:
+        """Make known what the recording's table and the times of its frames tell."""
+        zero = self.object.time_zero
+        known.values, known.clock = self.object.known, None if zero is None else KnownTime.of(known.model, zero)
 
     def in_frames(self, registration: Registration, frames: Sequence[Frame]) -> PlacedObject:
         """The same object, registered anew in the frames of an instant."""
@@ -166,7 +175,8 @@ class PlacedObject:
             per_sequence=self.registration.per_sequence,
             map_registration=self.registration.map_registration,
         )
-        return PlacedObject(self.object, self.cameras, registration, images, frames[0].index, in_sequence=True)
+        index, time = frames[0].index, frames[0].timestamp
+        return PlacedObject(self.object, self.cameras, registration, images, index, in_sequence=True, timestamp=time)
 
     def state_in(self, frame: int, keyframe_of: TrackedObject) -> State | None:
         """The object in a frame, or in a keyframe of another object's map; None where nobody knows."""
@@ -185,9 +195,11 @@ def new_anchor(placed: Sequence[PlacedObject]) -> Anchor | None:
     return Anchor.of(anchored, placed[0].camera) if anchored else None
 
 
-def frame_at(path: Path | str, number: int | None, depth_per_metre: float | None = None) -> Frame:
+def frame_at(
+    path: Path | str, number: int | None, depth_per_metre: float | None = None, fps: float | None = None
+) -> Frame:
     """A frame of a recording, the first one by default; raises SourceError if it is not there."""
-    for frame in open_source(path, number, number, depth_per_metre=depth_per_metre):
+    for frame in open_source(path, number, number, fps, depth_per_metre):
         return frame
     raise SourceError(f"{path} holds no frame {number} to take as the reference")
 
@@ -220,7 +232,8 @@ def place(part: TrackedObject, cameras: Sequence[RigCamera], frames_at: FramesAt
     depth, scale = frames[0].depth if part.options.use_depth else None, registration.depth_scale
     if depth is not None and scale is not None:
         depth = scale.corrected(depth)
-    return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence, depth=depth)
+    time = frames[0].timestamp if run.reference_image is None else None
+    return PlacedObject(part, tuple(cameras), placed, images, frames[0].index, in_sequence, depth=depth, timestamp=time)
 
 
 def _first_number(run: TrackOptions) -> int:

@@ -169,7 +169,7 @@ def _open_recordings(run: TrackOptions) -> tuple[Source, FramesAt]:
         wanted = run.first if number is None else number
         if whole is not None and whole.goes_by_time:
             return whole.at(wanted)
-        return tuple(frame_at(path, wanted, scale) for path, scale in _recordings(run))
+        return tuple(frame_at(path, wanted, scale, run.fps) for path, scale in _recordings(run))
 
     if whole is None or not whole.goes_by_time:
         sources = [open_source(path, run.first, run.last, run.fps, scale) for path, scale in _recordings(run)]
@@ -199,7 +199,7 @@ def _open_live(run: TrackOptions, stack: ExitStack) -> tuple[Source, FramesAt]:
             return (Frame(BEFORE_ALL, 0.0, read_image(run.reference_image, "the reference image")),)
         # A recording is not begun by that: it would play while everything is made ready.
         is_recorded = isinstance(stream, PacedRecording)
-        for frame in open_stream(run.frames, run.first, run.last, None, scale) if is_recorded else stream:
+        for frame in open_stream(run.frames, run.first, run.last, run.fps, scale) if is_recorded else stream:
             return (frame,)
         raise SourceError(f"{run.frames} ended before the first frame")
 
