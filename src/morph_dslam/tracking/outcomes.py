@@ -334,7 +334,10 @@ class DepthNotUsed(TrackingWarning):
         if self.ratio is None:
             return "no depth was measured on the object"
         at = f"{self.ratio:.3g} times its distance"
-        return f"depth does not count: it has the object at {at}; is it in metres (--depth-per-metre)?"
+        return (
+            f"depth does not count: it has the object at {at}; is it in metres (--depth-per-metre)? If so, the "
+            "registration is off: register with the depth image of the reference frame too (--depth)"
+        )
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,8 @@ class RunWarning(StrEnum):
     )
     DEPTH_NOT_USED = (
         "the depth images did not count in {count} of {n_frames} frames, first in frame {first}, where they show "
-        "nothing of the object or put it elsewhere (check --depth-per-metre); the reasons are in frames.csv"
+        "nothing of the object or put it elsewhere; check --depth-per-metre, or register with the depth image of the "
+        "reference frame too (--depth); the reasons are in frames.csv"
     )
     READOUT_NOT_USED = (
         "readout_s of the camera file did not count in {count} of {n_frames} frames, which have no times in seconds "
