@@ -118,7 +118,9 @@ def test_a_distance_by_depths_stays_as_uncertain_as_these_are():
         known.state.camera_from_object.translation[2] - scene.state(0.0).camera_from_object.translation[2]
     )
     by_registration /= np.sqrt(known.covariance[-1, -1])
-    assert along == pytest.approx([by_registration] * 2, rel=0.3)
+    # Were the depths of each frame another measurement of their scale, it would be many deviations off.
+    assert by_registration < 3.0
+    assert along == pytest.approx([by_registration] * 2, abs=1.0)
 
 
 @pytest.mark.slow

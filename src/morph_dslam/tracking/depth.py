@@ -112,6 +112,11 @@ class PointDepths:
         """These, all of them so many times as far away, as a depth camera whose scale is off has them."""
         return PointDepths(self.depths * factor, self.weights, self.squared_px, self.huber_px)
 
+    def off_by(self, further: Array) -> PointDepths:
+        """These, each off by ``further`` (p,), a standard deviation in metres, beside its noise."""
+        weights = self.weights / np.sqrt(1.0 + (self.weights * further) ** 2 / self.squared_px)
+        return PointDepths(self.depths, weights, self.squared_px, self.huber_px)
+
     def padded(self, count: int) -> PointDepths:
         """These, followed by points without depth, ``count`` in all."""
         missing = np.zeros(count - len(self.depths))

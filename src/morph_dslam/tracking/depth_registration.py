@@ -3,6 +3,9 @@
 A fixed pixel's depth is compared with that of the surface that the pixel sees. Where the surface slopes, that changes
 as the surface moves sideways too, so the derivatives are those with the pixel's point found anew in each state. With
 those of one material point, as of points whose pixels are measured, a sheet turned by 40 degrees ends millimetres off.
+
+Where in its pixel a depth was measured is not known. The steeper the surface is there, the more that matters: without
+it, the few pixels that graze a round body or the side of a block decide on the distance, by the size in the image.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.known_state import DepthTerm
 from morph_dslam.tracking.levenberg_marquardt import Minimum
-from morph_dslam.tracking.refinement import DIFFERENCE, EFFECTIVE_POINTS, minimum
+from morph_dslam.tracking.refinement import EFFECTIVE_POINTS, minimum
 
 Array = NDArray[np.float64]
 #: Points that are compared, how often they are chosen anew, and how many are needed.
@@ -31,6 +34,10 @@ POINTS, ROUNDS, LEAST = 600, 3, 30
 STEP = 1e-2
 #: Depths farther from the surface than this share of the object's size are of something else.
 LARGEST_DISTANCE = 0.05
+#: Deviation of a place that is anywhere in its pixel, in either direction of the image, pixels.
+IN_PIXEL = 12.0**-0.5
+#: Derivatives are differences over this, in `STEP`: over more of it a pixel that grazes goes from facet to facet.
+FINE = 1e-4
 #: Beside that they may be off by what this many deviations of their scale make.
 SCALE_SIGMAS = 3.0
 #: Depth within this many pixels of the object's rim may belong to what is behind it.
@@ -144,7 +151,8 @@ class _DepthFit:
         lower, upper = bounds[:, free]
         found = minimum(lambda step: self._residuals(columns @ step), np.zeros(columns.shape[1]), (lower, upper), 10)
         step = columns @ found.x
-        derivatives = np.asarray(approx_fprime(step, self._residuals, DIFFERENCE))
+        inwards = np.where(step + FINE > bounds[1], -FINE, FINE)
+        derivatives = np.asarray(approx_fprime(step, self._residuals, inwards))
         slopes, by_deviation, free = derivatives[:, :-1] / self._scale, derivatives[:, -1], free[:-1]
         variance, converged = self._sigma_px**2, found.status > 0
         hessian = variance * slopes.T @ slopes
@@ -235,6 +243,7 @@ def _depths_in_view(
     points, places = _surface_in_view(estimator, state)
     seen = np.ones(len(points), dtype=bool)
     depths = PointDepths.sampled(image, places, seen, estimator.camera, 1.0, sigma_at_1m)
+    depths = depths.off_by(IN_PIXEL * _steepness(estimator, state, points, places))
     size = float(np.linalg.norm(np.ptp(estimator.model.nodes, axis=0)))
     distances = points.in_camera(state)[:, 2]
     near = np.abs(depths.depths - distances) < LARGEST_DISTANCE * size + share_off * distances + off
@@ -257,3 +266,17 @@ def _surface_in_view(estimator: Estimator, state: State) -> tuple[BoundPoints, A
     pixels = np.column_stack([columns[chosen], rows[chosen]]).astype(float)
     surface, met = bind_pixels(model, camera, view, pixels)
     return BoundPoints.from_surface(model, surface), pixels[met]
+
+
+def _steepness(estimator: Estimator, state: State, points: BoundPoints, pixels: Array) -> Array:
+    """By how much the depth of the surface at points changes over a pixel where it does most (p,), metres.
+
+    In the plane with the normal n of a point's triangle the depth along the ray r = ((u - cx) / fx, (v - cy) / fy, 1)
+    is proportional to 1 / (n . r).
+    """
+    camera, distances = estimator.camera, points.in_camera(state)[:, 2]
+    corners = points.corners(estimator.model).in_camera(state).reshape(-1, 3, 3)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    towards = np.abs(np.sum(normals * camera.rays(pixels), axis=1))
+    return distances * np.hypot(normals[:, 0] / camera.fx, normals[:, 1] / camera.fy) / np.maximum(towards, 1e-9)
