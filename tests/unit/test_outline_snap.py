@@ -10,6 +10,7 @@ from morph_dslam.model import Parameter, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
 from morph_dslam.registration.landmarks import register_landmarks
 from morph_dslam.registration.messages import AtBound, OutlineContradicts, OutlineInexact, OutlineUnseen
+from tests.integration.test_outline_beside_texture import CAMERA as BEFORE_BLOCK, SpottedFilm, state as block_state
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, colours, mean_error, sheet_state
 
@@ -17,11 +18,11 @@ MODEL = bent_sheet_model(22, 16)
 CLICKS = 12
 
 
-def clicked(state, seed, sigma_px=1.5, model=MODEL):
-    """Landmarks on nodes of the sheet, as a hand sets them."""
+def clicked(state, seed, sigma_px=1.5, model=MODEL, camera=CAMERA):
+    """Landmarks on nodes of an object, as a hand sets them."""
     rng = np.random.default_rng(seed)
     nodes = rng.choice(len(model.nodes), CLICKS, replace=False)
-    pixels = CAMERA.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
+    pixels = camera.project(state.camera_from_object.apply(model.positions(state.parameters)))[nodes]
     return Landmarks(model.nodes[nodes], pixels + sigma_px * rng.standard_normal((CLICKS, 2)))
 
 
@@ -49,6 +50,18 @@ def test_the_outline_takes_out_most_of_what_clicks_are_off_by():
     assert np.mean(before) > 3.0
     assert np.mean(after) < 0.2 * np.mean(before)
     assert 0.5 < np.sqrt(np.mean(np.square(in_deviations))) < 1.6
+
+
+def test_an_outline_that_is_off_as_a_whole_leaves_errors_as_large_as_stated():
+    """All edges are a quarter of a pixel too far inwards, which has the block a millimetre farther off.
+
+    A tenth of a pixel is the deviation of that, so that 2.5 are expected, as in tests of the tracker.
+    """
+    film, truth = SpottedFilm(150, 3, gamma=2.2), block_state(0.0)
+    landmarks = clicked(truth, 3, 1.0, film.model, BEFORE_BLOCK)
+    found = register_landmarks(film.model, BEFORE_BLOCK, landmarks, image=film.frame(truth))
+    assert found.facts["corrected_by_outline"]
+    assert 2.0 < pose_and_parameter_errors(found, truth)[-1] < 3.2
 
 
 @pytest.mark.parametrize("seed", [8, 9, 10, 30, 32, 34])

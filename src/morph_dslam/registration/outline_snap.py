@@ -3,7 +3,8 @@
 Landmarks that people set are off by a pixel or two each, an outline of a hundred points only by a fraction of one. So
 the outline is searched for where the landmarks have it, and near there where they tell least, and pose and parameters
 are fitted to both. How exact the outline is, and how many of its points count as one because they err alike, is seen
-from what the fit leaves of it (`tracking.outline_weight`). Where too little of the outline is seen, where it fits worse
+from what the fit leaves of it (`tracking.outline_weight`). What all of it is off by no fit shows: it is in the
+covariance, by how exact single points are. Where too little of the outline is seen, where it fits worse
 than landmarks do, or where it pulls the object off them, it is not believed.
 """
 
@@ -24,7 +25,8 @@ from morph_dslam.tracking.covariance import floored_inverse
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, State, moved
 from morph_dslam.tracking.other_tilt import SAME_MINIMUM
 from morph_dslam.tracking.outline import Outline, OutlineMeasurement
-from morph_dslam.tracking.outline_weight import LEAST_SPREAD_PX, OutlineBalance
+from morph_dslam.tracking.outline_weight import LEAST_SPREAD_PX, OutlineBalance, whole_deviation
+from morph_dslam.tracking.reprojection import weighted_derivatives
 from morph_dslam.tracking.state import pose_increment
 
 Array = NDArray[np.float64]
@@ -105,7 +107,8 @@ class Snap:
 
     Attributes
     ----------
-    estimate : the state, its covariance counts points of the outline that err alike as one.
+    estimate : the state; its covariance counts points of the outline that err alike as one, and has what the whole
+        outline may be off by.
     measured : landmarks, of weight 1, and outline.
     landmarks_squared : sum of the landmarks' squared residuals beside the outline, large ones by Huber's cost, px^2.
     outline_px : (p,) how far the outline is off each point where the state has it; infinite where it was not found.
@@ -260,7 +263,6 @@ class OutlineSnap:
     ) -> Snap:
         k, n, ones = len(self._pixels), self._estimator.box.n_unknowns, np.ones(len(self._pixels))
         measured = self._measured(seen, sigma, redundancy * variance)
-        hessian = self._estimator.evaluate(*measured.at(estimate.state))[1]
         alone, beside = (
             self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0]
             for state in (by_landmarks, estimate.state)
@@ -268,7 +270,7 @@ class OutlineSnap:
         rise = 2.0 * max(beside - alone, 0.0) / self._sigma**2 / n
         away = np.linalg.norm(estimate.residuals[k:], axis=1)
         return Snap(
-            replace(estimate, covariance=sigma**2 * self._inverse(hessian)),
+            replace(estimate, covariance=self._covariance(measured, estimate, sigma, variance)),
             measured,
             2.0 * beside,
             np.where(seen.valid, away, np.inf)[seen.expected],
@@ -278,6 +280,22 @@ class OutlineSnap:
             float(seen.valid.sum()) / max(int(seen.expected.sum()), 1),
             float(fdtrc(n, max(2 * k - n, 1), rise)),
         )
+
+    def _covariance(self, measured: MeasuredPoints, estimate: Estimate, sigma: float, variance: float) -> Array:
+        """The estimate's covariance (d + 6, d + 6) by errors of single points, and by what the whole outline is off by.
+
+        Parameters
+        ----------
+        measured : landmarks, of weight 1 and the deviation ``sigma``, and outline.
+        estimate : made from it.
+        variance : of a point of the outline, px^2.
+        """
+        state, estimator = estimate.state, self._estimator
+        inverse = self._inverse(estimator.evaluate(*measured.at(state))[1])
+        seen = estimate.residuals, measured.weights, measured.normals, estimator.options.huber_px
+        by_one_px = weighted_derivatives(*measured.points.in_state(state), estimator.camera.intrinsics, *seen)[2]
+        moved_by_whole = whole_deviation(variance) * by_one_px @ inverse
+        return sigma**2 * inverse + moved_by_whole.T @ moved_by_whole
 
     def _inverse(self, hessian: Array) -> Array:
         """The inverse (d + 6, d + 6) in the unknowns that are free, zero in those that are known."""

@@ -116,13 +116,8 @@ class OutlineBalance:
 
     @property
     def common_px(self) -> float:
-        """What the outline may be off by as a whole, a standard deviation, pixels: as much as its points are.
-
-        Residuals do not tell of it, as the state takes it up. But what displaces single points, such as clutter, an
-        edge that is rounded or a model that is off, may displace them together.
-        """
-        variance = self.outline.variance
-        return LEAST_COMMON_PX if np.isnan(variance) else max(LEAST_COMMON_PX, float(np.sqrt(variance)))
+        """What the outline may be off by as a whole, see `whole_deviation`."""
+        return whole_deviation(self.outline.variance)
 
     def correlation(self, seen: OutlineMeasurement) -> scipy.sparse.csr_array:
         """Of the errors (p, p) of the outline's points; those that do not count have none in common."""
@@ -186,6 +181,19 @@ class OutlineBalance:
         near = np.abs(across) < AGREEING_SIGMAS * max(robust, LEAST_SPREAD_PX)
         variance = robust**2 * len(across) / left
         self.outline.learn(seen.pixels[used][near], across[near, None], float(variance))
+
+
+def whole_deviation(variance: float) -> float:
+    """What an outline may be off by as a whole, a standard deviation, pixels: as much as its single points are.
+
+    Residuals do not tell of it, as the state takes it up. But what displaces single points, such as clutter, an edge
+    that is rounded or a model that is off, may displace them together.
+
+    Parameters
+    ----------
+    variance : of a single point, squared pixels; NaN where it is not known.
+    """
+    return LEAST_COMMON_PX if np.isnan(variance) else max(LEAST_COMMON_PX, float(np.sqrt(variance)))
 
 
 def mean_square(residuals: Array, weights: Array, n_unknowns: int) -> float:
