@@ -14,6 +14,7 @@ from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking import still_run, track as track_module
+from morph_dslam.tracking.frame_estimation import FrameEstimation
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.state import State
 from morph_dslam.tracking.still_notices import PoseAwayFromLandmarks
@@ -116,6 +117,30 @@ def test_what_a_sensor_was_said_to_tell_holds_when_the_pose_is_sharpened(sharpen
         assert tracker.track(image).parameters["arch"] == pytest.approx(told, abs=4e-5)
     part.goes_on.set()
     assert replaced(sharpening, tracker).track(image).parameters["arch"] == pytest.approx(told, abs=4e-5)
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_a_tracker_in_another_pose_goes_on_where_the_one_before_it_was(sharpened, monkeypatch, is_lost):
+    """The sheet has straightened since the reference picture, and its points were looked for 7 pixels away."""
+    part, image = sharpened
+    film, bent, offsets = SheetFilm(bent_sheet_model(22, 16)), sheet_state(0.1), []
+    shapes = [replace(bent, parameters=share * bent.parameters) for share in (1.0, 0.6, 0.2, -0.2)]
+    before, new = part.new_tracker(), part.new_tracker()
+    for shape in shapes[:3]:
+        assert before.track(film.frame(shape)).tracked
+    if is_lost:
+        assert not before.track(np.full_like(image, 128)).tracked
+    new.take_over(before)
+    correct = FrameEstimation.correct
+
+    def looking(self, picture, state, away, prior):
+        offsets.append(away)
+        return correct(self, picture, state, away, prior)
+
+    monkeypatch.setattr(FrameEstimation, "correct", looking)
+    found = new.track(film.frame(shapes[3]))
+    assert (found.tracked, found.recovered) == (True, is_lost)
+    assert (offsets[0] is None) if is_lost else (np.abs(offsets[0]).max() < 0.1)
 
 
 @dataclass(frozen=True)

@@ -494,8 +494,12 @@ class Tracker:
 
     def take_over(self, other: Tracker) -> None:
         """Go on after the last frame of another tracker of the object, with what that knows but for the pose."""
-        self.continue_from(replace(other.state, camera_from_object=self.state.camera_from_object))
-        self._last_by_points = self._last
+        pose = self.state.camera_from_object
+        self.continue_from(replace(other.state, camera_from_object=pose))
+        self._last_by_points, self._velocity_base = self._last, replace(other._velocity_base, camera_from_object=pose)
+        # From that frame, not the reference picture: the object may have another shape since.
+        self._image, self._pixels = other._image, self.reference.projected(self._last)
+        self._lost, self._n_lost = other._lost, other._n_lost
         self.know_jumps(other.jumps)
         self.estimator.known.take(other.estimator.known)
         if self.estimator.loads is not None and other.estimator.loads is not None:
