@@ -348,7 +348,9 @@ def test_frames_come_over_a_socket_and_pictures_go_back(sender):
     with open_live(path) as stream:
         other, _ = listening.accept()
         with other:
-            other.sendall(sent(4, b"no picture at all") + sent(7, jpeg.tobytes(), 2.5))
+            size = bytes(jpeg).find(b"\xff\xc0") + 5
+            damaged = bytes(jpeg[:size]) + b"\xf0" * 4 + bytes(jpeg[size + 4 :])  # of 61680 times 61680 pixels
+            other.sendall(sent(4, b"no picture at all") + sent(5, damaged) + sent(7, jpeg.tobytes(), 2.5))
             frame = next(iter(stream))
             assert (frame.index, frame.timestamp, frame.image.shape) == (7, 2.5, (48, 64, 3))
             assert np.abs(frame.image.astype(int) - 90).max() <= 2

@@ -6,6 +6,7 @@ import struct
 from dataclasses import replace
 from datetime import datetime, timedelta
 from types import SimpleNamespace
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -85,6 +86,16 @@ def test_images_are_known_by_their_content(tmp_path):
     cut.write_bytes(cut.read_bytes()[:-2])
     with pytest.raises(SourceError, match=r"frame 2: .*2\.png is cut short"):
         list(open_source(misnamed))
+
+
+def test_an_image_of_an_absurd_size_is_refused(folder):
+    """As a damaged head says, for which OpenCV raises an error of its own."""
+    path = folder / "shot-2.png"
+    content = path.read_bytes()
+    head = b"IHDR" + struct.pack(">II", 60000, 60000) + content[24:29]
+    path.write_bytes(content[:12] + head + struct.pack(">I", crc32(head)) + content[33:])
+    with pytest.raises(SourceError, match=r"frame 2: .*shot-2\.png cannot be decoded as an image"):
+        list(open_source(folder))
 
 
 @pytest.mark.parametrize("width", [48, 32])

@@ -257,10 +257,19 @@ def _decode(path: Path, what: str, flags: int) -> NDArray:
     # Behind the picture more may follow: phones put a short video there.
     if marker and data.find(marker, _start_of_scan(data) if marker == _END_MARKERS[".jpg"] else 0) < 0:
         raise SourceError(f"{what}: {path} is cut short: copy it again")
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    image = decoded(data, flags)
     if image is None:
         raise SourceError(f"{what}: {path} cannot be decoded as an image")
-    return np.asarray(image)
+    return image
+
+
+def decoded(data: bytes | NDArray[np.uint8], flags: int = cv2.IMREAD_COLOR) -> NDArray | None:
+    """An encoded image (h, w) or (h, w, channels), as ``flags`` of OpenCV ask for it; None where it is none."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if len(data) else None
+    except cv2.error:  # of a size that a damaged head has
+        return None
+    return None if image is None else np.asarray(image)
 
 
 def _start_of_scan(data: bytes) -> int:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from morph_dslam.errors import SourceError
-from morph_dslam.sources.frames import ASSUMED_FPS, Frame
+from morph_dslam.sources.frames import ASSUMED_FPS, Frame, decoded
 from morph_dslam.sources.live import LiveStream, SteadyTimes
 
 #: Of a frame: its number, its time in seconds, bytes of its JPEG.
@@ -57,9 +57,9 @@ class SocketCamera(LiveStream):
                 raise SourceError(f"{self.name} sent {size} bytes as frame {index}: a frame has {MOST_BYTES} at most")
             data = self._exactly(size)
             captured, seconds = time.monotonic(), times.add(seconds)
-            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _FLAGS) if data else None
+            image = decoded(data, _FLAGS)
             if image is not None:
-                yield Frame(index, seconds, np.asarray(image, dtype=np.uint8), captured=captured)
+                yield Frame(index, seconds, image.astype(np.uint8, copy=False), captured=captured)
 
     def _exactly(self, count: int) -> bytes:
         """The next bytes; none where the connection ends."""

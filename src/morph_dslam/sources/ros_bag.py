@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.errors import SourceError, how_to_install
 from morph_dslam.io.file_kinds import file_kind
-from morph_dslam.sources.frames import Frame, check_range, check_size, usual_rate
+from morph_dslam.sources.frames import Frame, check_range, check_size, decoded, usual_rate
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -141,7 +141,7 @@ def _timestamp(message: Any, received: int) -> float:
 def _decode(message: Any, what: str) -> NDArray[np.uint8]:
     """The image (h, w, 3) uint8, blue, green, red, of a message."""
     if hasattr(message, "format"):
-        image = cv2.imdecode(np.frombuffer(message.data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        image = decoded(message.data)
         if image is None:
             raise SourceError(f"{what} cannot be decoded ({message.format})")
         return np.asarray(image, dtype=np.uint8)

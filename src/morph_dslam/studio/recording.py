@@ -15,6 +15,7 @@ from PIL import ExifTags, Image
 
 from morph_dslam import Frame, open_source
 from morph_dslam.errors import StudioError
+from morph_dslam.sources.frames import decoded
 from morph_dslam.sources.recorded import RecordedFrames
 from morph_dslam.studio.project import read_once
 
@@ -95,7 +96,7 @@ def frame_jpeg(path: Path, number: int) -> bytes:
 
 def check_jpeg(jpeg: bytes) -> None:
     """Raise StudioError if this cannot be decoded."""
-    if cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) is None:
+    if decoded(jpeg) is None:
         raise StudioError("the frame cannot be decoded: take another one")
 
 
