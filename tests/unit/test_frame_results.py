@@ -44,7 +44,9 @@ class View:
         self._exact, self._rng = CAMERA.project(self._points.in_camera(LATER)), np.random.default_rng(0)
         part = BoundPart(slice(None), REFERENCE, error_factors_of(np.diag(STD**2), self.estimator.scale))
         unused: Any = anything
-        beside = SimpleNamespace(estimator=self.estimator, hessian_of_outline=lambda *_: None)
+        beside = SimpleNamespace(
+            estimator=self.estimator, hessian_of_outline=lambda *_: None, whole_outline=lambda *_: None
+        )
         self.active: Any = SimpleNamespace(
             systematic=SystematicErrors(self.estimator, self._points, [part], 17),
             recovery=Recovery(MODEL, CAMERA, unused, unused, TrackerOptions()),

@@ -10,11 +10,13 @@ from morph_dslam.tracking.reference_correction import (
     PushedDepths,
     PushedTexture,
     corrected,
-    of_common_errors,
+    of_whole_outline,
 )
 
 N_POINTS, N_OUTLINE, N_UNKNOWNS, N_FACTORS = 12, 30, 5, 4
 SQUARED_PX, WEIGHT, COMMON_PX = 0.04, 0.3, 0.7
+#: What was found before, and normal equations of an outline without points.
+NOT_YET, NO_OUTLINE = np.zeros(N_FACTORS + 3), (np.zeros((N_UNKNOWNS, 3)), np.zeros((3, 3)), np.zeros(3))
 #: Of the points whose fits are checked: how many, their deviation, pixels, and what the correction moves them by.
 N_CHECKED, NOISE_PX, SHIFT_PX = 60, 0.2, 0.4
 
@@ -34,31 +36,37 @@ def frame():
     )
 
 
-def correction(frame):
+def correction(frame, with_outline=None, before=None):
+    """As `corrected` finds it; again, where the points have been corrected by what it found ``before``."""
     jacobian, transfer, across, normals, residuals, off = frame
+    residuals = residuals if before is None else residuals + before.shift
     points = Linearization.of(jacobian, residuals, np.ones(N_POINTS), 1e3)
     weights = np.full(N_OUTLINE, WEIGHT)
     flat = jacobian.reshape(-1, N_UNKNOWNS)
     hessian = flat.T @ flat + WEIGHT * across.T @ across
     gradient = flat.T @ residuals.ravel() + WEIGHT * across.T @ off
-    common = of_common_errors(across, off, weights, normals, SQUARED_PX, COMMON_PX)
-    whole = hessian - common[0], gradient - common[1]
-    texture = PushedTexture(points, transfer)
-    return corrected(texture, whole, SQUARED_PX, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))
+    whole = of_whole_outline(across, off, weights, normals, COMMON_PX)
+    texture, causes = PushedTexture(points, transfer, None, with_outline), NOT_YET if before is None else before.causes
+    return corrected(texture, (hessian, gradient), whole, SQUARED_PX, np.ones(N_UNKNOWNS), causes)
 
 
-def design(frame):
-    """Rows of one fit of state, error factors and errors of the whole outline, in deviations of a number."""
+def design(frame, with_outline=None):
+    """Rows of one fit of state, error factors and errors of the whole outline, in deviations of a number.
+
+    ``with_outline`` : (N_FACTORS, 3) covariance of the factors and the errors of the outline; None for none.
+    """
     jacobian, transfer, across, normals, residuals, off = frame
     flat, sigma = jacobian.reshape(-1, N_UNKNOWNS), np.sqrt(SQUARED_PX)
     common = np.column_stack([np.ones(N_OUTLINE), normals])
     nothing = np.zeros
+    known = np.eye(N_FACTORS + 3)
+    if with_outline is not None:
+        known[:N_FACTORS, N_FACTORS:], known[N_FACTORS:, :N_FACTORS] = with_outline, with_outline.T
     rows = np.block(
         [
             [flat, flat @ transfer, nothing((2 * N_POINTS, 3))],
-            [np.sqrt(WEIGHT) * across, nothing((N_OUTLINE, N_FACTORS)), np.sqrt(WEIGHT) * common],
-            [nothing((N_FACTORS, N_UNKNOWNS)), sigma * np.eye(N_FACTORS), nothing((N_FACTORS, 3))],
-            [nothing((3, N_UNKNOWNS + N_FACTORS)), sigma / COMMON_PX * np.eye(3)],
+            [np.sqrt(WEIGHT) * across, nothing((N_OUTLINE, N_FACTORS)), np.sqrt(WEIGHT) * COMMON_PX * common],
+            [nothing((N_FACTORS + 3, N_UNKNOWNS)), sigma * np.linalg.cholesky(np.linalg.inv(known)).T],
         ]
     )
     return rows, np.concatenate([residuals.ravel(), np.sqrt(WEIGHT) * off, np.zeros(N_FACTORS + 3)])
@@ -73,6 +81,19 @@ def test_it_is_that_of_one_fit_of_all_unknowns(frame):
     np.testing.assert_allclose(found.left @ found.left, covariance, rtol=1e-8)
     moves = np.einsum("pkn,n->pk", frame[0], frame[1] @ together[of_factors])
     np.testing.assert_allclose(found.shift, moves, rtol=1e-8)
+
+
+def test_an_outline_does_not_make_good_what_it_has_put_into_the_reference_itself(frame):
+    """Against one fit that knows how both go together; and again from there, which changes nothing."""
+    with_outline = np.random.default_rng(8).standard_normal((N_FACTORS, 3))
+    with_outline *= 0.8 / np.linalg.norm(with_outline, 2)
+    found, (rows, left) = correction(frame, with_outline), design(frame, with_outline)
+    together, covariance = np.linalg.lstsq(rows, -left)[0], SQUARED_PX * np.linalg.inv(rows.T @ rows)
+    of_factors, of_outline = slice(N_UNKNOWNS, N_UNKNOWNS + N_FACTORS), slice(N_UNKNOWNS + N_FACTORS, None)
+    for each in (found, correction(frame, with_outline, found)):
+        np.testing.assert_allclose(each.found, together[of_factors], rtol=1e-8)
+        np.testing.assert_allclose(each.left @ each.left, covariance[of_factors, of_factors], rtol=1e-8)
+        np.testing.assert_allclose(each.left @ each.with_outline, covariance[of_factors, of_outline], rtol=1e-8)
 
 
 def test_what_the_points_still_tell_is_what_is_left_beside_unknown_error_factors(frame):
@@ -94,7 +115,7 @@ def test_depths_tell_of_it_what_one_fit_of_all_unknowns_does(frame):
     points = Linearization.of(jacobian, residuals, np.ones(N_POINTS), 1e3)
     whole = flat.T @ flat + slopes.T @ slopes, flat.T @ residuals.ravel() + slopes.T @ off
     texture = PushedTexture(points, transfer, depths)
-    found = corrected(texture, whole, SQUARED_PX, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))
+    found = corrected(texture, whole, NO_OUTLINE, SQUARED_PX, np.ones(N_UNKNOWNS), NOT_YET)
     known = np.sqrt(SQUARED_PX) * np.eye(N_FACTORS)
     rows = np.block([[flat, flat @ transfer], [slopes, per_metre * metres], [np.zeros((N_FACTORS, N_UNKNOWNS)), known]])
     together = np.linalg.lstsq(rows, -np.concatenate([residuals.ravel(), off, np.zeros(N_FACTORS)]))[0]
@@ -115,7 +136,7 @@ def test_without_an_outline_the_registration_stays_as_it_is(frame):
     residuals = (noise - flat @ np.linalg.lstsq(flat, noise)[0]).reshape(-1, 2)
     points = Linearization.of(jacobian, residuals, np.ones(N_POINTS), 1e3)
     whole = flat.T @ flat, np.zeros(N_UNKNOWNS)
-    found = corrected(PushedTexture(points, transfer), whole, 1.0, np.ones(N_UNKNOWNS), np.zeros(N_FACTORS))
+    found = corrected(PushedTexture(points, transfer), whole, NO_OUTLINE, 1.0, np.ones(N_UNKNOWNS), NOT_YET)
     np.testing.assert_allclose(found.found, 0.0, atol=1e-12)
     np.testing.assert_allclose(found.left, np.eye(N_FACTORS), atol=1e-10)
 

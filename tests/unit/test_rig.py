@@ -368,7 +368,7 @@ def test_what_each_camera_s_outline_leaves_of_the_reference_s_error_moves_the_es
         told = own + np.linalg.solve(root.T, rng.standard_normal(own.shape).T).T
         covariance = np.linalg.inv(np.eye(count) + information)
         off += (own - told @ information @ covariance)[:, :3] @ moves[camera].T
-        corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
+        corrections.append(ReferenceCorrection(*[nothing] * 3, sqrtm(covariance).real, *[nothing] * 3))
     errors = RigErrors(trackers, RIG, [CommonDepthScale(), CommonDepthScale(0.01)])
     plain = replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance
@@ -399,7 +399,7 @@ def test_what_depths_leave_of_their_scale_goes_with_what_they_leave_of_the_refer
         told = own @ direction + told_std * rng.standard_normal(len(z))
         left = own - np.outer(told, direction / told_std**2) @ covariance
         off += left @ np.array(moves[2 * camera : 2 * camera + 2])
-        corrections.append(ReferenceCorrection(nothing, nothing, nothing, sqrtm(covariance).real, nothing))
+        corrections.append(ReferenceCorrection(*[nothing] * 3, sqrtm(covariance).real, *[nothing] * 3))
     errors = RigErrors(trackers, RIG, [CommonDepthScale(std)] * 2)
     plain = replace(before, covariance=np.zeros((9, 9)))
     stated = errors.added(plain, errors.views(plain, seen, corrections), None, [0.0, 0.0]).covariance

@@ -19,7 +19,8 @@ from morph_dslam.tracking.covariance import (
     trace_of_share,
 )
 from morph_dslam.tracking.depth import PointDepths
-from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, LinearCost
+from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, ReferenceMisfit
 from morph_dslam.tracking.sequence_filter import SequenceFilter
@@ -354,6 +355,39 @@ def test_what_holds_an_estimate_beside_its_points_holds_it_against_the_reference
         np.testing.assert_allclose(
             np.sqrt(np.diag(stated.covariance)) / estimator.scale, np.abs(off_by) / estimator.scale, atol=within
         )
+
+
+def test_a_state_that_was_found_beside_an_outline_is_off_with_it_and_goes_on_being_so(model, pixels):
+    """All edges are too far outwards, by which the state is too near, and in another frame both have it too near."""
+    estimator = Estimator(model, CAMERA, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-12))
+    true_points, n, off_px = bound(model, REFERENCE, pixels), len(pixels), 0.3
+    seen, (beside, places, normals) = CAMERA.project(true_points.in_camera(LATER)), rim(model, LATER)
+    step = -1e-3 * np.eye(9)[8]
+    points, every = bound(model, moved(REFERENCE, step), pixels), np.ones(n + len(places))
+
+    def estimated(points, outwards):
+        both = np.vstack([seen, places + outwards * normals]), np.vstack([np.zeros((n, 2)), normals])
+        found = estimator.estimate(points.joined(beside), both[0], every, LATER, both[1])
+        turned = pose_increment(LATER.camera_from_object, found.state.camera_from_object)
+        return found, np.concatenate([found.state.parameters - LATER.parameters, turned])
+
+    found, off = estimated(points, off_px)
+    _, by_outline = estimated(true_points, off_px)
+    own = Observations(beside, places, every[n:], normals, common_px=off_px)
+    whole = LinearCost.about(own, LATER, np.zeros_like(places), CAMERA, 50.0, estimator.scale).in_common
+    whole[1:] = 0.0  # no shift
+    of_outline = estimator.of_pixels(beside, places, every[n:], LATER, normals)[1]
+    part = BoundPart(slice(None), moved(REFERENCE, step), error_factors_of(np.outer(step, step), estimator.scale))
+    plain = replace(found, covariance=np.outer(by_outline, by_outline), residuals=found.residuals[:n])
+    away, within = [], 0.1 * np.abs(off / estimator.scale).max()
+    for with_outline in (np.outer(step, [1.0, 0.0, 0.0]), None):
+        errors = SystematicErrors(estimator, points, [part], WINDOW, with_outline=with_outline)
+        stated = errors.added(plain, np.ones(n), 0.0, learns=False, of_outline=of_outline, whole=whole)
+        away.append(np.sqrt(stated.covariance[8, 8]))
+        if with_outline is not None:  # a view that this frame becomes gets the same of its state
+            np.testing.assert_allclose(errors.with_outline[:, 0] / estimator.scale, off / estimator.scale, atol=within)
+    assert away[0] == pytest.approx(abs(off[8]), rel=0.05)
+    assert away[1] < 0.8 * away[0], "as if both told the distance independently"
 
 
 #: Standard deviations of arch, skew, twist, rotation and translation, SI.

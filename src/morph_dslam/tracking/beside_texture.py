@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from morph_dslam.even_rows import evenly
 from morph_dslam.tracking.covariance import trace_of_share
 from morph_dslam.tracking.depth import PointDepths
-from morph_dslam.tracking.estimator import Estimator, State
+from morph_dslam.tracking.estimator import Estimator, LinearCost, State
 from morph_dslam.tracking.hypothesis import Image, PoseHypothesis
 from morph_dslam.tracking.known_values import LEAST_SIGMA_PX
 from morph_dslam.tracking.levenberg_marquardt import Minimum
@@ -224,6 +224,18 @@ class BesideTexture:
         if (seen := attempt.outline) is None:
             return None
         return self.estimator.of_pixels(seen.points, seen.pixels, seen.weights, state, seen.normals)[1]
+
+    def whole_outline(self, attempt: PoseHypothesis, state: State) -> Array | None:
+        """How what an outline beside the points is off by as a whole enters the gradient (3, d + 6) at a state.
+
+        As of `LinearCost`; None without one.
+        """
+        if (seen := attempt.outline) is None:
+            return None
+        residuals = self.estimator.of_pixels(seen.points, seen.pixels, seen.weights, state, seen.normals)[3]
+        measured = Observations(seen.points, seen.pixels, seen.weights, seen.normals, common_px=self.balance.common_px)
+        options, camera, scale = self.estimator.options, self.estimator.camera, self.estimator.scale
+        return LinearCost.about(measured, state, residuals, camera, options.huber_px, scale).in_common
 
     def _weighed(self, attempt: PoseHypothesis, state: State) -> PoseHypothesis:
         """The attempt whose depths count by what they show in a state that they are off by, once corrected."""

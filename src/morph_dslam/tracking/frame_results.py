@@ -158,7 +158,8 @@ def _with_systematic_errors(
     # Learned from the images alone.
     learns = is_its_own and blurred is None and not len(beside.estimator.known.indices)
     found, prior = hypothesis.estimate, hypothesis.prior
-    others = hypothesis.corrected_depths, beside.hessian_of_outline(hypothesis, found.state), hypothesis.correction
+    of_outline, whole = (of(hypothesis, found.state) for of in (beside.hessian_of_outline, beside.whole_outline))
+    others = hypothesis.corrected_depths, of_outline, hypothesis.correction, whole
     estimate = systematic.added(found, hypothesis.weights, common_px, prior, learns, *known, blurred, *others)
     warnings: list[TrackingWarning] = [*refuted, *([PastForgotten()] if past.forgot else [])]
     if blurred is not None:

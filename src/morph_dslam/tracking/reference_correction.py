@@ -15,7 +15,9 @@ makes good: an outline that counts then pulls the points from where they fit. `C
 
 An outline may err as a whole: light from one side moves the edges on that side, and a rounded edge all of them. So it
 tells nothing that a shift of all of it, or one outwards, would explain: two more unknowns and a third. Their deviation
-is `OutlineBalance.common_px`.
+is `OutlineBalance.common_px`. A reference state that frames beside an outline have found is off with them, and the
+outline of further frames, which they have displaced as much, tells nothing of that part: z = R w + A b, with b the
+three, w what else makes z, A the covariance of z and b, and R R' = I - A A'.
 
 Depths tell of z in the same way, and have residuals J_d x + D z: a point that lies elsewhere on the surface has another
 depth there, and all depths may be too large by one factor. That is one more error factor; where depths have placed the
@@ -73,11 +75,14 @@ class PushedTexture:
     frame : the points about the state
     transfer : (d + 6, c), G: how the points alone have the object off by each error factor.
     depths : of the points; None where no depth camera saw them.
+    with_outline : (c, 3) covariance of the error factors with what the outline is off by as a whole, each in its
+        deviation; None where they have nothing in common.
     """
 
     frame: Linearization
     transfer: Array
     depths: PushedDepths | None = None
+    with_outline: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,8 @@ class ReferenceCorrection:
     transfer : (d + 6, c) as of `PushedTexture`.
     left : (c, c), a symmetric root of the covariance that is left of them, the stated one being the identity.
     information_lost : (d + 6, d + 6) of the points' Hessian, what the unknown error of the reference takes from it.
+    causes : (c + 3,) of what makes ``found``, in deviations: w and b.
+    with_outline : (c, 3) covariance with b of the independent causes of what is left, of which ``left`` is the root.
     nearer : (p,) metres, by which it moves the depths of the texture's points; None where there are none.
     """
 
@@ -99,6 +106,8 @@ class ReferenceCorrection:
     transfer: Array
     left: Array
     information_lost: Array
+    causes: Array
+    with_outline: Array
     nearer: Array | None = None
 
     def of_depths(self, depths: PointDepths) -> PointDepths:
@@ -192,7 +201,7 @@ def reference_correction(
     texture : the points about the minimum.
     squared_px : variance of a number of weight one, times how many points of the texture count as one.
     before : the correction so far; None for the first one.
-    common_px : as in `of_common_errors`.
+    common_px : as in `of_whole_outline`.
     """
     count, state = len(texture.frame.usable), found.state
     _, hessian, gradient, residuals = estimator.evaluated(together, state)
@@ -203,15 +212,15 @@ def reference_correction(
     weights = np.where(np.isfinite(off), together.weights[outline] * huber, 0.0)
     used = weights > 0.0
     normals = together.normals[outline][used]
-    common = of_common_errors(across[used], off[used], weights[used], normals, squared_px, common_px)
-    so_far = np.zeros(texture.transfer.shape[1]) if before is None else before.found
-    return corrected(texture, (hessian - common[0], gradient - common[1]), squared_px, estimator.scale, so_far)
+    whole = of_whole_outline(across[used], off[used], weights[used], normals, common_px)
+    so_far = np.zeros(texture.transfer.shape[1] + 3) if before is None else before.causes
+    return corrected(texture, (hessian, gradient), whole, squared_px, estimator.scale, so_far)
 
 
-def of_common_errors(
-    across: Array, off: Array, weights: Array, normals: Array, squared_px: float, common_px: float
-) -> tuple[Array, Array]:
-    """What errors of a whole outline take away from the Hessian (n, n) and the gradient (n,) of its points.
+def of_whole_outline(
+    across: Array, off: Array, weights: Array, normals: Array, common_px: float
+) -> tuple[Array, Array, Array]:
+    """How the three errors b of a whole outline, each in its deviation, enter the normal equations of its points.
 
     Parameters
     ----------
@@ -219,18 +228,24 @@ def of_common_errors(
     off : (k,) residuals along these, pixels.
     weights : (k,).
     normals : (k, 2) outwards.
-    squared_px : variance of a number of weight one.
-    common_px : standard deviation of what the outline may be off by as a whole in each direction, and outwards, pixels.
+    common_px : standard deviation of what the outline may be off by as a whole outwards, and in each direction, pixels.
+
+    Returns
+    -------
+    Their part of the Hessian beside the n unknowns (n, 3) and by themselves (3, 3), and of the gradient (3,).
     """
-    common = np.column_stack([np.ones(len(normals)), normals])
+    common = common_px * np.column_stack([np.ones(len(normals)), normals])
     weighted = weights[:, None] * common
-    inverse = np.linalg.inv(weighted.T @ common + squared_px / common_px**2 * np.eye(3))
-    mixed = across.T @ weighted
-    return mixed @ inverse @ mixed.T, mixed @ inverse @ (weighted.T @ off)
+    return across.T @ weighted, weighted.T @ common, weighted.T @ off
 
 
 def corrected(
-    texture: PushedTexture, others: tuple[Array, Array], squared_px: float, scale: Array, before: Array
+    texture: PushedTexture,
+    others: tuple[Array, Array],
+    whole: tuple[Array, Array, Array],
+    squared_px: float,
+    scale: Array,
+    before: Array,
 ) -> ReferenceCorrection:
     """The reference's error by a frame's normal equations.
 
@@ -238,26 +253,45 @@ def corrected(
     ----------
     texture : the points, whose residuals a correction before has changed already.
     others : Hessian (d + 6, d + 6) and gradient (d + 6,) of all measurements, the points too, and of what else is
-        known, without what the outline does not tell.
+        known.
+    whole : of the outline among them, as of `of_whole_outline`.
     squared_px : variance of a number of weight one, times how many points of the texture count as one.
     scale : (d + 6,) of the unknowns.
-    before : (c,) the error factors that were corrected.
+    before : (c + 3,) the causes by which the points were corrected.
     """
-    (hessian, gradient), frame, transfer = others, texture.frame, texture.transfer
-    stated = squared_px * np.eye(len(before))
+    (hessian, gradient), (by_whole, of_whole, push_of_whole), frame = others, whole, texture.frame
+    transfer, count = texture.transfer, texture.transfer.shape[1]
     pushed = frame.hessian @ transfer
-    by_points, push = stated + transfer.T @ pushed, transfer.T @ frame.products(frame.residuals[:, :, None])[:, 0]
+    by_points, push = transfer.T @ pushed, transfer.T @ frame.products(frame.residuals[:, :, None])[:, 0]
     if (depths := texture.depths) is not None:
         pushed = pushed + depths.slopes.T @ depths.pushes
         by_points, push = by_points + depths.pushes.T @ depths.pushes, push + depths.pushes.T @ depths.residuals
+    information_lost = pushed @ np.linalg.solve(squared_px * np.eye(count) + by_points, pushed.T)
+    # By the causes w and b, which are independent.
+    shared = np.zeros((count, 3)) if texture.with_outline is None else texture.with_outline
+    by_cause, undone = np.hstack([symmetric_root(np.eye(count) - shared @ shared.T), shared]), before[count:]
+    pushed, push = pushed @ by_cause, by_cause.T @ push
+    information = squared_px * np.eye(count + 3) + by_cause.T @ by_points @ by_cause
+    pushed[:, count:] += by_whole
+    information[count:, count:] += of_whole
+    # The outline was not corrected by what was found of b before.
+    push[count:] += push_of_whole + of_whole @ undone
     gain = inverse_of_seen(hessian, scale) @ pushed
-    information = by_points - pushed.T @ gain
-    found = before - np.linalg.solve(information, push + stated @ before - gain.T @ gradient)
+    information -= pushed.T @ gain
+    slope = push + squared_px * before - gain.T @ (gradient + by_whole @ undone)
+    causes = before - np.linalg.solve(information, slope)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     # No measurement makes the registration worse known than it was; rounding may seem to.
     shares = np.clip(squared_px / np.maximum(values, 1e-300), 0.0, 1.0)
-    left = (vectors * np.sqrt(shares)) @ vectors.T
-    information_lost = pushed @ np.linalg.solve(by_points, pushed.T)
+    of_causes = (vectors * shares) @ vectors.T
+    found, left = by_cause @ causes, symmetric_root(by_cause @ of_causes @ by_cause.T)
+    with_outline = np.linalg.pinv(left, hermitian=True) @ by_cause @ of_causes[:, count:]
     shift = np.einsum("pkn,n->pk", frame.jacobian, transfer @ found)
     nearer = None if depths is None else depths.metres @ found
-    return ReferenceCorrection(found, shift, transfer, left, information_lost, nearer)
+    return ReferenceCorrection(found, shift, transfer, left, information_lost, causes, with_outline, nearer)
+
+
+def symmetric_root(covariance: Array) -> Array:
+    """The symmetric root (c, c) of a covariance, of which rounding may have made an eigenvalue negative."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

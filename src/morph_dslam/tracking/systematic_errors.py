@@ -71,12 +71,16 @@ class SystematicErrors:
     window : side of the square that is compared around a point, pixels
     still : whether the reference view's pose is that of every frame, with the same error
     scale : of the depths, if a depth camera sees the points.
+    with_outline : (d + 6, 3) covariance of the reference state's error with what outlines are off by as a whole, each
+        in its deviation, where frames beside an outline have found that state; None where they have not.
 
     Attributes
     ----------
     beyond_reference : of the last frame; None where that does not tell, or the reference gets no blame.
     with_scale : (d + 6,) covariance of the error of the last frame that was kept with by what share all depths are too
         large, as far as the reference's error and the depths' scale make it.
+    with_outline : (d + 6, 3) covariance of that error with what its outline was off by as a whole, each in its
+        deviation: outwards, and in both directions.
     """
 
     def __init__(
@@ -87,6 +91,7 @@ class SystematicErrors:
         window: int,
         still: bool = False,
         scale: CommonDepthScale | None = None,
+        with_outline: Array | None = None,
     ) -> None:
         self._estimator, self._points, self._still = estimator, points, still
         self._misfit = ReferenceMisfit()
@@ -103,6 +108,7 @@ class SystematicErrors:
         self._n_reference = len(self._shares)
         self._scale = scale or CommonDepthScale()
         self._take_scale(self._scale, parts)
+        self._outline_shares = self._shares_of_outline(with_outline)
         self._common = SharedErrors(self._places(parts[0].state), window)
         self.beyond_reference: BeyondReference | None = None
         self.forget_frames()
@@ -144,14 +150,27 @@ class SystematicErrors:
     def _shares_of_state(self, scale: CommonDepthScale) -> Array:
         """By what share each of the reference state's error factors (c,) has all depths too large.
 
-        With the factors F of the state it is the a with F a = ``scale.with_state``, no more than the scale's deviation.
+        It is no more than the scale's deviation.
+        """
+        assert scale.with_state is not None
+        found = self._by_factor(scale.with_state)
+        return found * min(1.0, scale.std / max(float(np.linalg.norm(found)), 1e-300))
+
+    def _shares_of_outline(self, with_outline: Array | None) -> Array:
+        """Covariance (c, 3) of the error factors with what the outline is off by, which is of variance one."""
+        if with_outline is None or self._factors is None:
+            return np.zeros((len(self._shares), 3))
+        left, sizes, right = np.linalg.svd(self._by_factor(with_outline), full_matrices=False)
+        return np.asarray((left * np.minimum(sizes, 1.0)) @ right)
+
+    def _by_factor(self, covariance: Array) -> Array:
+        """Covariance (c, ...) of each of the reference state's error factors with what the state's error has that of.
+
+        With the factors F of the state it is the a with F a = ``covariance`` (d + 6, ...).
         """
         assert self._factors is not None
-        assert scale.with_state is not None
-        unit = self._estimator.scale
-        found = np.linalg.lstsq(self._factors / unit[:, None], scale.with_state / unit, rcond=LEAST_FACTOR)[0]
-        share = min(1.0, scale.std / max(float(np.linalg.norm(found)), 1e-300))
-        return np.asarray(found * share, dtype=np.float64)
+        inverse = np.linalg.pinv(self._factors / self._estimator.scale[:, None], rcond=LEAST_FACTOR)
+        return np.asarray((inverse / self._estimator.scale) @ covariance, dtype=np.float64)
 
     def _farther(self, part: BoundPart) -> Array:
         """By what share each error factor has the surface at the pixels of a part's points farther away (p, c)."""
@@ -177,7 +196,8 @@ class SystematicErrors:
         """The next estimate does not rest on earlier ones, or their errors are in its covariance already."""
         size = len(self._estimator.scale)
         n_factors = 0 if self._moved is None else self._moved.shape[2]
-        self._by_reference, self.with_scale = np.zeros((size, n_factors)), np.zeros(size)
+        self._by_reference = np.zeros((size, n_factors))
+        self._by_outline, self.with_outline, self.with_scale = np.zeros((size, 3)), np.zeros((size, 3)), np.zeros(size)
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
@@ -224,6 +244,7 @@ class SystematicErrors:
         depths: PointDepths | None = None,
         of_outline: Array | None = None,
         corrected: ReferenceCorrection | None = None,
+        whole: Array | None = None,
     ) -> Estimate:
         """The estimate with a covariance that holds both errors, that of motion blur, and that of the depths' scale.
 
@@ -241,6 +262,8 @@ class SystematicErrors:
         depths : (p,) of the points, where a depth camera saw them; None without one.
         of_outline : (d + 6, d + 6) the Hessian of an outline beside the points; None without one.
         corrected : what of the reference's error the points were corrected by; None where they were not.
+        whole : (3, d + 6) how what that outline is off by as a whole enters the gradient, as of `LinearCost`. The
+            estimate's covariance has it already, but not what it has in common with the reference's error.
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
@@ -254,6 +277,7 @@ class SystematicErrors:
         gain, n_pairs = inverse_of_seen(hessian, self._estimator.scale), self._common.n_pairs(frame.usable)
         covariance, by_reference, self.beyond_reference = estimate.covariance.copy(), self._by_reference, None
         stated = estimate.covariance
+        by_outline = with_outline = gain @ ((0.0 if whole is None else whole.T) + past @ self._by_outline)
         if self._moved is not None:
             moved = self._warped(estimate.state, self._moved)
             push = self.pushed(frame, estimate.state, depths, moved)
@@ -276,6 +300,11 @@ class SystematicErrors:
             if keeps:
                 self.with_scale = widened @ (self._shares if corrected is None else corrected.left @ self._shares)
             stated = stated + by_reference @ by_reference.T
+            shares = self._outline_shares if corrected is None else corrected.with_outline
+            with_outline = by_outline + widened @ shares
+            for total, part in ((covariance, widened), (stated, by_reference)):
+                in_common = part @ shares @ by_outline.T
+                total += in_common + in_common.T
         gradients = self._common.gradients(frame.weighted_jacobian)
         share = self._common.share_left(frame.usable, frame.jacobian, gradients, gain, n_pairs)
         by_model = gain @ (common_px / np.sqrt(share) * gradients.T + past @ self._by_model)
@@ -285,6 +314,7 @@ class SystematicErrors:
             covariance += by_blur @ by_blur.T
         if keeps:
             self._by_reference, self._by_model = by_reference, by_model
+            self._by_outline, self.with_outline = by_outline, with_outline
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
     @property
@@ -392,7 +422,8 @@ class SystematicErrors:
         frame = Linearization.of(self._project(state)[1], residuals, weights, self._estimator.options.huber_px)
         moved = self._warped(state, self._moved)
         transfer = inverse_of_seen(frame.hessian, self._estimator.scale) @ frame.products(moved)
-        return PushedTexture(frame, transfer, None if depths is None else self._pushed_depths(state, depths, moved))
+        of_depths = None if depths is None else self._pushed_depths(state, depths, moved)
+        return PushedTexture(frame, transfer, of_depths, self._outline_shares)
 
     def pushed_by_model(self, frame: Linearization, chain: Array, gain: Array, common_px: float) -> Array:
         """How an estimate from several cameras moves (n, c) by what the model is off in this one.

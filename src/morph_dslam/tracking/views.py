@@ -274,14 +274,18 @@ class ActiveView:
         number: int = 0,
         error: float = 0.0,
         scale: CommonDepthScale | None = None,
+        with_outline: Array | None = None,
     ) -> ActiveView:
-        """A view that is to be followed from now on, with these numbers; ``scale`` is that of the depths."""
+        """A view that is to be followed from now on, with these numbers.
+
+        ``scale`` is that of the depths, ``with_outline`` as of `SystematicErrors`.
+        """
         estimation = FrameEstimation(estimator, reference, options)
         recovery = Recovery(estimator.model, estimator.camera, reference, estimation, options)
         systematic = None
         if not reference.outline_alone:
             still, parts = options.pose == "still" and not number, reference.parts
-            systematic = SystematicErrors(estimator, reference.points, parts, PATCH_WINDOW, still, scale)
+            systematic = SystematicErrors(estimator, reference.points, parts, PATCH_WINDOW, still, scale, with_outline)
         return cls(number, reference, estimation, recovery, systematic, error)
 
 
@@ -313,12 +317,14 @@ class _BegunView:
     error : as in `ActiveView`.
     seen : of `SurfaceSamples` in it.
     scale : of the depths, with how far its state's error is theirs; None without them.
+    with_outline : as of `SystematicErrors`; None where nothing tells of it.
     """
 
     reference: ReferenceView
     error: float
     seen: Array
     scale: CommonDepthScale | None
+    with_outline: Array | None
 
 
 class ViewSet:
@@ -454,7 +460,7 @@ class ViewSet:
         scale, systematic = self._scale, self.active.systematic
         if scale is not None and systematic is not None:
             scale = replace(scale, with_state=systematic.with_scale)
-        return _BegunView(made, spread, now, scale)
+        return _BegunView(made, spread, now, scale, None if systematic is None else systematic.with_outline)
 
     def _of_one_instant(self, picture: Image, state: State) -> Image:
         """The picture as of the middle row's instant, around the object in ``state``."""
@@ -473,7 +479,8 @@ class ViewSet:
             self.active.reference.take_features()
             return None
         self._n_made += 1
-        view = ActiveView.of(begun.reference, self._estimator, self._options, self._n_made, begun.error, begun.scale)
+        made_by = self._estimator, self._options, self._n_made
+        view = ActiveView.of(begun.reference, *made_by, begun.error, begun.scale, begun.with_outline)
         self._kept.append(view)
         self._seen.append(begun.seen)
         if len(self._kept) > self._options.max_views:
