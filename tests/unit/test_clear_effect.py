@@ -41,12 +41,8 @@ def seen_of(points, state, errors=0.0):
 
 def followed(seed, loads=LOADS):
     """Errors and stated deviations (f,) of the side, half of the noise being the same in all frames."""
-    points, rng, start, found = (
-        bound_points(model(), COUNT),
-        np.random.default_rng(seed),
-        State(model().default, POSE),
-        [],
-    )
+    points, rng, found = bound_points(model(), COUNT), np.random.default_rng(seed), []
+    start = State(model().default, POSE)
     filtered, stays = SequenceFilter(estimator(), [TURN]), rng.standard_normal((COUNT, 2))
     for load in loads:
         errors = np.sqrt(0.5) * SIGMA * (stays + rng.standard_normal((COUNT, 2)))

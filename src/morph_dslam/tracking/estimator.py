@@ -64,8 +64,7 @@ class LinearCost:
     ) -> LinearCost:
         """That of the measurements of a frame, about a state that leaves these residuals (p, 2)."""
         points, seen = measured.points, (residuals, measured.weights, measured.normals, huber_px)
-        found = weighted_derivatives(*points.in_state(state), camera.intrinsics, *seen)
-        weighted_jacobian, hessian, of_one_px = found
+        weighted_jacobian, hessian, of_one_px = weighted_derivatives(*points.in_state(state), camera.intrinsics, *seen)
         of_depths = np.zeros_like(hessian)
         if measured.depths is not None:
             _, part, _, far = measured.depths.terms(points, state)

@@ -447,16 +447,14 @@ def detect_orb(
     return np.array([k.pt for k in keypoints]), descriptors
 
 
-def match_descriptors(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], ratio: float = 0.85
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (k,) of descriptors that match one another: nearest both ways, clearly nearer than the second.
+#: Of two that match, the distance is at most this share of that to the next best one.
+CLEARLY_NEARER = 0.85
 
-    Parameters
-    ----------
-    first, second : (n, 32) and (m, 32) binary descriptors.
-    ratio : of the distances to the two nearest, at most.
-    """
+
+def match_descriptors(
+    first: NDArray[np.uint8], second: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (k,) of descriptors (n, 32) and (m, 32) that match: nearest both ways, clearly nearer than the second."""
     if len(first) < 2 or len(second) < 2:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
@@ -466,7 +464,7 @@ def match_descriptors(
     pairs = [
         (best.queryIdx, best.trainIdx)
         for best, runner_up in matcher.knnMatch(first, second, k=2)
-        if best.distance < ratio * runner_up.distance and back[best.trainIdx] == best.queryIdx
+        if best.distance < CLEARLY_NEARER * runner_up.distance and back[best.trainIdx] == best.queryIdx
     ]
     rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     return rows[:, 0], rows[:, 1]
