@@ -13,6 +13,7 @@ from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.render.texture import render_textured
 from morph_dslam.tracking import views
 from morph_dslam.tracking.estimator import State
+from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import pose_increment
 from tests.support.clicked import clicked
 from tests.support.rendered_sequence import UPRIGHT, colours
@@ -133,7 +134,14 @@ def test_an_outline_that_is_off_as_a_whole_leaves_errors_as_large_as_stated(opti
 def test_views_that_frames_became_are_as_far_off_as_the_outline_that_they_were_found_beside(monkeypatch):
     """Each view's outline seemed to confirm where the one before had the object: a millimetre was 4.6 deviations."""
     monkeypatch.setattr(views, "choose_view", lambda shares, errors, active: None)  # every third frame becomes one
-    far, sizes, made = [], [], set()
+    far, sizes, made, change_points = [], [], set(), SequenceFilter.change_points
+
+    def changing(self, change):
+        scale = tracker.estimator.scale
+        assert np.linalg.eigvalsh(change.besides / np.outer(scale, scale)).min() > -1e-12, "no covariance"
+        change_points(self, change)
+
+    monkeypatch.setattr(SequenceFilter, "change_points", changing)
     for seed in range(2):
         film = SpottedFilm(400, seed, gamma=2.2)
         known = clicked(film.model, CAMERA, state(0.0), np.random.default_rng(seed))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from morph_dslam.evaluation.run_folder import Run
 from morph_dslam.model import ReducedModel
 from morph_dslam.model.model_errors import ModelErrors
+from morph_dslam.tracking.covariance import symmetric_root
 
 Array = NDArray[np.float64]
 Vector = Callable[[Mapping[str, float]], Array]
@@ -64,12 +65,6 @@ def shape_errors(
     share = STEP / max(float(np.abs(list(changes.values())).max()), np.finfo(float).tiny)
     differences = [positions(moved(share, k)) - positions(moved(-share, k)) for k in range(len(ranges))]
     return np.array(differences) / (2.0 * share)
-
-
-def symmetric_root(covariance: Array) -> Array:
-    """Of a covariance (d, d), the symmetric root (d, d): in neighbouring states its columns are alike."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=np.float64)
 
 
 def state_errors(run: Run, rows: Sequence[int], vector: Vector, slopes: Callable[[Array], Array]) -> Array:

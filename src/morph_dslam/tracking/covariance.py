@@ -214,6 +214,12 @@ def huber_covariance(hessian, residuals, weights, numbers, huber_px, scale):
     return max(sigma, LEAST_SPREAD_PX), scaled(inverse, scale)
 
 
+def symmetric_root(covariance: Array) -> Array:
+    """The symmetric root (n, n) of a covariance; of what is none, that of the part whose eigenvalues are positive."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=np.float64)
+
+
 @njit(cache=True, nogil=True)
 def floored_inverse(hessian):
     """Inverse of a Hessian (k, k), no eigenvalue of which counts as less than `EIGENVALUE_FLOOR` of the largest."""

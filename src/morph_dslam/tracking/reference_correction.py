@@ -32,6 +32,7 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
+from morph_dslam.tracking.covariance import symmetric_root
 from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import Estimator
 from morph_dslam.tracking.levenberg_marquardt import Minimum
@@ -289,9 +290,3 @@ def corrected(
     shift = np.einsum("pkn,n->pk", frame.jacobian, transfer @ found)
     nearer = None if depths is None else depths.metres @ found
     return ReferenceCorrection(found, shift, transfer, left, information_lost, causes, with_outline, nearer)
-
-
-def symmetric_root(covariance: Array) -> Array:
-    """The symmetric root (c, c) of a covariance, of which rounding may have made an eigenvalue negative."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

@@ -23,6 +23,7 @@ from morph_dslam.sources import Frame
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring, CameraLocalization
 from morph_dslam.tracking.compilation import announce_compilation
+from morph_dslam.tracking.covariance import symmetric_root
 from morph_dslam.tracking.depth_scale import CommonDepthScale, DepthScale
 from morph_dslam.tracking.discrepancy import DiscrepancyFit
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, JumpDetector
@@ -594,7 +595,10 @@ class Tracker:
             change = self._views.after_tracked(image, hypothesis, result.estimate, result.unexplained_px)
         if change is None:
             return None
-        self._filter.change_points(self._views.point_change(change.view, self._unfiltered))
+        # What the filter knows and what it does not may partly cancel out: it goes on with what is added alone.
+        scale = self.estimator.scale
+        besides = scale[:, None] * symmetric_root(self._unfiltered / np.outer(scale, scale))
+        self._filter.change_points(self._views.point_change(change.view, besides @ besides.T))
         self._unfiltered = np.zeros_like(self._unfiltered)
         if change.view.systematic is not None:
             change.view.systematic.forget_frames()
