@@ -263,7 +263,7 @@ def _decode(path: Path, what: str, flags: int) -> NDArray:
     return image
 
 
-def decoded(data: bytes | NDArray[np.uint8], flags: int = cv2.IMREAD_COLOR) -> NDArray | None:
+def decoded(data: bytes, flags: int = cv2.IMREAD_COLOR) -> NDArray | None:
     """An encoded image (h, w) or (h, w, channels), as ``flags`` of OpenCV ask for it; None where it is none."""
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if len(data) else None
