@@ -110,12 +110,14 @@ def _joined_rows(known, of_loads, coefficients):
     r, m = of_loads.shape[1], len(coefficients)
     result = np.zeros((rows + m, a + m * r))
     for i in range(rows):
-        result[i, :a] = known[i]
+        for j in range(a):
+            result[i, j] = known[i, j]
         for k in range(m):
             for j in range(r):
                 result[i, a + k * r + j] = coefficients[k] * of_loads[i, j]
     for k in range(m):
-        result[rows + k, a + k * r : a + (k + 1) * r] = of_loads[0]
+        for j in range(r):
+            result[rows + k, a + k * r + j] = of_loads[0, j]
     return result
 
 

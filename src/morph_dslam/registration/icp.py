@@ -281,7 +281,8 @@ def step_prior(weight, size, metric):
     metric : whether the scale stays: its weight is infinite.
     """
     prior = np.full(7, PRIOR * max(weight, 1.0))
-    prior[:4] *= size**2
+    for i in range(4):
+        prior[i] *= size**2
     if metric:
         prior[0] = np.inf
     return prior

@@ -194,8 +194,9 @@ def drawn_depth(edges, rotation, translation, intrinsics, width, height, shrink)
     bottom = int(min(max(np.ceil(most_v) + 1.0, 0.0), high))
     if left >= right or top >= bottom:
         return nothing, 0, 0
-    pixels[:, 0] -= left
-    pixels[:, 1] -= top
+    for n in range(len(pixels)):
+        pixels[n, 0] -= left
+        pixels[n, 1] -= top
     return draw_depth(pixels, depths, edges.triangles, edges.closed, bottom - top, right - left)[1], left, top
 
 

@@ -181,7 +181,8 @@ def lay_over(phases, margin, offsets, normals, turns, size, columns, rows, best,
                 start[p] = (phase * height + y // STEP) * width + x // STEP + low
             few[:] = 0
             _add_lines(flat, start[:FEW_POINTS], few)
-            more[:] = few
+            for k in range(count):
+                more[k] = few[k]
             _add_lines(flat, start[FEW_POINTS:MORE_POINTS], more)
             for first in range(0, count, BLOCK):
                 if _largest(more[first : first + BLOCK]) < MORE_GAIN * PER_GAIN:

@@ -29,6 +29,8 @@ from morph_dslam.slam.bundle_adjustment import (
 from morph_dslam.small_arrays import cholesky_solve, median
 
 Array = NDArray[np.float64]
+#: The number of a camera that is the only one. Compiled loops take a plain integer as a type of its own.
+ONLY = np.int64(0)
 
 
 def camera_matrix(intrinsics: Array) -> Array:
@@ -91,14 +93,14 @@ def _normal_equations(pose, points, pixels, camera, width, used):
     for i in range(len(points)):
         if not used[i]:
             continue
-        x, y, z = in_camera(poses, 0, points, i)
+        x, y, z = in_camera(poses, ONLY, points, i)
         if z < LEAST_DEPTH:
             cost += width * 1000.0
             continue
         misses[0], misses[1], misses[2] = residual(x, y, z, pixels, i, camera)
         term, weight = huber(np.sqrt(misses[0] ** 2 + misses[1] ** 2 + misses[2] ** 2), width)
         cost += term
-        jacobians(x, y, z, poses, 0, camera, rows, by_point)
+        jacobians(x, y, z, poses, ONLY, camera, rows, by_point)
         for row in range(2 if np.isnan(pixels[i, 2]) else 3):
             for j in range(6):
                 weighted = weight * rows[row, j]
@@ -139,7 +141,7 @@ def _errors(pose, points, pixels, camera):
     """Distances (n,) in pixels between projected points (n, 3) and pixels (n, 2 or 3); inf behind the camera."""
     result, poses = np.empty(len(points)), pose.reshape(1, 4, 4)
     for i in range(len(points)):
-        x, y, z = in_camera(poses, 0, points, i)
+        x, y, z = in_camera(poses, ONLY, points, i)
         result[i] = np.inf
         if z > LEAST_DEPTH:
             result[i] = math.hypot(

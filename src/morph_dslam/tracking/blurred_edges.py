@@ -18,8 +18,9 @@ from morph_dslam.row_products import FAST
 
 Array = NDArray[np.float64]
 #: Kinds of edges. A smooth surface turns away, where its brightness changes with the square root of the distance too;
-#: something narrow ends, which is alike throughout, and so is what is to either side of it.
-SMOOTH, NARROW = 0, 1
+#: something narrow ends, which is alike throughout, and so is what is to either side of it. Compiled loops take a plain
+#: integer as a type of its own.
+SMOOTH, NARROW = np.int64(0), np.int64(1)
 #: How many columns each kind has.
 N_COLUMNS = (5, 3)
 #: Noise of a grey level, at least.
