@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from morph_dslam.cli.app import main
 from morph_dslam.io.trajectory import Trajectory, save_trajectory
+from morph_dslam.tracking import run_plots
 from tests.support.rendered_anchored import make_anchored_recording
 from tests.support.rendered_anchored_rig import (
     load_truth,
@@ -54,9 +55,11 @@ def pytest_collection_finish():
 def blank_figures():
     """Figures that tests have saved are blank: to draw those of a run takes longer than to track it.
 
-    Slow tests draw, and those that ask for `drawn_figures`. Gives contexts for fixtures of wider scope that do.
+    A quarter of the time of a short run is the axes of its plots, which are not made either. Slow tests draw, and those
+    that ask for `drawn_figures`. Gives contexts for fixtures of wider scope that do.
     """
     save = Figure.savefig
+    plots = {name: plot for name, plot in vars(run_plots).items() if name.startswith("plot_")}
 
     def save_blank(self, path, **options):
         content = BLANK.get(options.get("format", str(path)[-3:]))
@@ -71,10 +74,14 @@ def blank_figures():
     def drawn():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Figure, "savefig", save)
+            for name, plot in plots.items():
+                patch.setattr(run_plots, name, plot)
             yield
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", save_blank)
+        for name in plots:
+            patch.setattr(run_plots, name, lambda path, run: path.write_bytes(BLANK["png"]))
         yield drawn
 
 

@@ -287,6 +287,7 @@ def test_refined_reference_is_named_and_still_right(inputs, tmp_path):
     assert error_of(run, 6) < 1e-3
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_run_without_the_object_is_whole_and_says_that_nothing_was_found(inputs, tmp_path):
     """Only the blank frame is tracked; the object is known from another one."""
     chosen = options(inputs, tmp_path / "run", first=24, last=24, reference_frame=20)
