@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from morph_dslam.camera import Camera
@@ -100,8 +101,14 @@ class Views:
         return np.nan_to_num(by_pose), np.nan_to_num(by_point), np.nan_to_num(by_unknowns)
 
 
+def _sums(groups: Indices, count: int, values: Array) -> Array:
+    """Sums (count, ...) of the values (o, ...) of each group (o,)."""
+    members = csr_array((np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups)))
+    return (members @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
+
+
 class _Normal:
-    """Normal equations of poses and camera after the points are eliminated.
+    """Normal equations of poses, points and camera; the points are eliminated where they are solved.
 
     Parameters
     ----------
@@ -109,7 +116,6 @@ class _Normal:
     residuals : (o, 2) and their ``weights`` (o,).
     derivatives : as of `Views.derivatives`, of the camera's s free unknowns only
     information : (s,) of the prior; ``offsets`` (s,) how far the unknowns are from it
-    damping : as a part of the diagonal
     """
 
     def __init__(
@@ -120,64 +126,67 @@ class _Normal:
         derivatives: tuple[Array, Array, Array],
         information: Array,
         offsets: Array,
-        damping: float,
     ) -> None:
         self._views, self._residuals, self._weights, self._derivatives = views, residuals, weights, derivatives
         (by_pose, by_point, by_camera), n_frames, n_points = derivatives, len(views.poses), len(views.points)
         frame, point, n = views.frame_idx, views.point_idx, 6 * n_frames
         self._n, size = n, n + by_camera.shape[2]
         scaled = weights[:, None, None] * by_pose, weights[:, None, None] * by_point
-        blocks, poses = np.zeros((n_frames, 6, 6)), np.zeros((n_frames, 6, by_camera.shape[2]))
-        np.add.at(blocks, frame, by_pose.transpose(0, 2, 1) @ scaled[0])
-        np.add.at(poses, frame, scaled[0].transpose(0, 2, 1) @ by_camera)
+        blocks = _sums(frame, n_frames, by_pose.transpose(0, 2, 1) @ scaled[0])
         matrix = np.zeros((size, size))
         for f in range(n_frames):
             matrix[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] = blocks[f]
-        matrix[:n, n:] = poses.reshape(n, -1)
+        matrix[:n, n:] = _sums(frame, n_frames, scaled[0].transpose(0, 2, 1) @ by_camera).reshape(n, -1)
         matrix[n:, :n] = matrix[:n, n:].T
         matrix[n:, n:] = np.einsum("o,oki,okj->ij", weights, by_camera, by_camera) + np.diag(information)
-        right = np.zeros(size)
-        np.add.at(right[:n].reshape(-1, 6), frame, -np.einsum("oki,ok->oi", scaled[0], residuals))
-        right[n:] = -np.einsum("o,oki,ok->i", weights, by_camera, residuals) - information * offsets
-        of_points, point_right = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
-        np.add.at(of_points, point, by_point.transpose(0, 2, 1) @ scaled[1])
-        np.add.at(point_right, point, -np.einsum("oki,ok->oi", scaled[1], residuals))
-        cross = np.zeros((n_frames, 6, n_points, 3))
-        cross[frame, :, point] = by_pose.transpose(0, 2, 1) @ scaled[1]
-        camera_cross = np.zeros((n_points, by_camera.shape[2], 3))
-        np.add.at(camera_cross, point, by_camera.transpose(0, 2, 1) @ scaled[1])
-        cross = np.concatenate([cross.reshape(n, -1), camera_cross.transpose(1, 0, 2).reshape(size - n, 3 * n_points)])
+        of_frames = _sums(frame, n_frames, -np.einsum("oki,ok->oi", scaled[0], residuals))
+        of_camera = -np.einsum("o,oki,ok->i", weights, by_camera, residuals) - information * offsets
+        cross = np.zeros((n_points, size, 3))
+        cross[:, :n].reshape(n_points, n_frames, 6, 3)[point, frame] = by_pose.transpose(0, 2, 1) @ scaled[1]
+        cross[:, n:] = _sums(point, n_points, by_camera.transpose(0, 2, 1) @ scaled[1])
+        self._matrix, self._right, self._cross = matrix, np.append(of_frames.ravel(), of_camera), cross
+        self._of_points = _sums(point, n_points, by_point.transpose(0, 2, 1) @ scaled[1])
+        self._point_right = _sums(point, n_points, -np.einsum("oki,ok->oi", scaled[1], residuals))
+
+    def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
+        """Matrix (n, n) and right-hand side (n,) without the points, and inverses (p, 3, 3) of the points' blocks."""
+        of_points, matrix, cross = self._of_points, self._matrix, self._cross
         # A ridge as part of the mean keeps the scale, which nothing determines, where it is.
-        of_points += damping * of_points * np.eye(3) + 1e-9 * of_points.trace(axis1=1, axis2=2).mean() * np.eye(3)
-        self._inverse, self._cross, self._point_right = np.linalg.inv(of_points), cross, point_right
-        carried = (cross.reshape(size, n_points, 1, 3) @ self._inverse).reshape(size, -1)
-        reduced = matrix + np.diag((damping + 1e-9) * np.diag(matrix)) - carried @ cross.T
-        right = right - carried @ point_right.ravel()
+        ridge = 1e-9 * of_points.trace(axis1=1, axis2=2).mean() * np.eye(3)
+        inverse = np.linalg.inv(of_points + damping * of_points * np.eye(3) + ridge)
+        carried = cross @ inverse
+        eliminated = np.tensordot(carried, cross, axes=([0, 2], [0, 2]))
+        reduced = matrix + np.diag((damping + 1e-9) * np.diag(matrix)) - eliminated
+        right = self._right - np.tensordot(carried, self._point_right, axes=([0, 2], [0, 1]))
         # The first pose is held.
         reduced[:6], reduced[:, :6], right[:6] = 0.0, 0.0, 0.0
         reduced[range(6), range(6)] = 1.0
-        self._reduced, self._right = reduced, right
+        return reduced, right, inverse
 
-    def step(self) -> tuple[Array, Array, Array]:
-        """Twists of the poses (f, 6), shifts of the points (p, 3), change of the camera's unknowns (s,)."""
-        step = np.linalg.solve(self._reduced, self._right)
-        rest = self._point_right - (self._cross.T @ step).reshape(-1, 3)
-        return step[: self._n].reshape(-1, 6), np.einsum("pij,pj->pi", self._inverse, rest), step[self._n :]
+    def step(self, damping: float) -> tuple[Array, Array, Array]:
+        """Twists of the poses (f, 6), shifts of the points (p, 3), change of the camera's unknowns (s,).
+
+        ``damping`` : as a part of the diagonal.
+        """
+        reduced, right, inverse = self._reduced(damping)
+        step = np.linalg.solve(reduced, right)
+        rest = self._point_right - np.einsum("pij,i->pj", self._cross, step)
+        return step[: self._n].reshape(-1, 6), np.einsum("pij,pj->pi", inverse, rest), step[self._n :]
 
     def covariance(self, information: Array, deviations: Array) -> Array:
         """Of the unknowns (s, s), by clusters of residuals, and by a prior (s,) of such deviations and information."""
         views, (by_pose, by_point, by_camera) = self._views, self._derivatives
-        size, n = len(self._reduced), self._n
-        inverse = np.linalg.solve(self._reduced, np.eye(size)[:, n:])
-        of_points = self._inverse @ (self._cross.T @ inverse).reshape(len(self._inverse), 3, size - n)
+        size, n = len(self._matrix), self._n
+        reduced, _, points_inverse = self._reduced(0.0)
+        inverse = np.linalg.solve(reduced, np.eye(size)[:, n:])
+        of_points = points_inverse @ (self._cross.transpose(0, 2, 1) @ inverse)
         influence = by_pose @ inverse[:n].reshape(len(views.poses), 6, size - n)[views.frame_idx]
         influence = influence + by_camera @ inverse[n:] - by_point @ of_points[views.point_idx]
         scores = np.einsum("o,oki,ok->oi", self._weights, influence, self._residuals)
         result = inverse[n:].T @ np.diag((information * deviations) ** 2) @ inverse[n:]
         n_residuals, n_unknowns = 2 * len(scores), 3 * len(views.points) + size
         for groups in (views.frame_idx, views.point_idx):
-            sums = np.zeros((groups.max() + 1, size - n))
-            np.add.at(sums, groups, scores)
+            sums = _sums(groups, groups.max() + 1, scores)
             result += sums.T @ sums * n_residuals / max(n_residuals - n_unknowns, 1)
         return result
 
@@ -209,16 +218,16 @@ def solve(views: Views, given: Camera, unknowns: Array, free: Indices, huber_px:
         terms = np.where(errors < width, 0.5 * errors**2, width * (errors - 0.5 * width))
         return float(terms.sum() + 0.5 * information @ unknowns[free] ** 2)
 
-    def normal(damping: float) -> _Normal:
+    def normal() -> _Normal:
         residuals = views.residuals(given, unknowns)
         weights = np.minimum(1.0, width / np.maximum(np.linalg.norm(residuals, axis=1), 1e-12))
         by_pose, by_point, by_camera = views.derivatives(given, unknowns)
         derivatives = by_pose, by_point, by_camera[:, :, free]
-        return _Normal(views, residuals, weights, derivatives, information, unknowns[free], damping)
+        return _Normal(views, residuals, weights, derivatives, information, unknowns[free])
 
-    damping, before = 1e-4, cost(views, unknowns)
+    damping, before, equations = 1e-4, cost(views, unknowns), normal()
     for _ in range(ITERATIONS):
-        pose_steps, point_steps, step = normal(damping).step()
+        pose_steps, point_steps, step = equations.step(damping)
         new_views, new_unknowns = views.moved(pose_steps, point_steps), unknowns.copy()
         new_unknowns[free] += step
         now = cost(new_views, new_unknowns)
@@ -226,7 +235,7 @@ def solve(views: Views, given: Camera, unknowns: Array, free: Indices, huber_px:
             damping *= 10.0
             continue
         gain, views, unknowns, before = (before - now) / before, new_views, new_unknowns, now
-        damping = max(0.1 * damping, 1e-9)
+        damping, equations = max(0.1 * damping, 1e-9), normal()
         if gain < LEAST_GAIN:
             break
-    return Solution(views, unknowns, normal(0.0).covariance(information, deviations), before)
+    return Solution(views, unknowns, equations.covariance(information, deviations), before)
