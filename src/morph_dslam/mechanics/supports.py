@@ -40,6 +40,7 @@ class Constraints:
         symbols: ParameterSymbols,
     ) -> None:
         self._space, self._shape, self._symbols, self._mesh = space, shape, symbols, space.geometry.mesh
+        self._mean_of_set: dict[str, Array] = {}  # asked for in each evaluation of the equations
         self._foundations = [s for s in supports if isinstance(s, ElasticFoundation)]
         self._motions: list[PrescribedMotion] = [s for s in supports if not isinstance(s, ElasticFoundation)]
         held = np.zeros((3, space.n_scalar), dtype=bool)
@@ -155,8 +156,10 @@ class Constraints:
 
     def centroid(self, name: str) -> tuple[Array, Array]:
         """Mean (3,) of the undeformed nodes of a set, m, and its derivatives (d, 3)."""
-        rows = self._space.node_values[self._mesh.set_nodes(name)]
-        weights = np.asarray(rows.mean(axis=0)).ravel()
+        weights = self._mean_of_set.get(name)
+        if weights is None:
+            rows = self._space.node_values[self._mesh.set_nodes(name)]
+            weights = self._mean_of_set[name] = np.asarray(rows.mean(axis=0)).ravel()
         slopes = self._shape.coordinate_slopes(self._symbols)
         return weights @ self._shape.coordinates(self._symbols), np.einsum("n,dnc->dc", weights, slopes)
 
