@@ -56,25 +56,27 @@ def is_number(value):
     return {"np"}.issuperset(node.id for node in ast.walk(value) if isinstance(node, ast.Name))
 
 
+def fills_a_part(step):
+    """Whether an array or a tuple may go to a part of an array: numba compiles the message for shapes that differ."""
+    targets = step.targets if isinstance(step, ast.Assign) else [step.target]
+    places = [node.slice for target in targets for node in ast.walk(target) if isinstance(node, ast.Subscript)]
+    if any(isinstance(node, ast.Slice) for place in places for node in ast.walk(place)):
+        return isinstance(step, ast.AugAssign) or not is_number(step.value)
+    return isinstance(step.value, ast.Tuple) and any(isinstance(target, ast.Subscript) for target in targets)
+
+
 def parts_filled_in(text):
-    """Where arrays may be assigned to parts of others: numba compiles the message for shapes that differ."""
     loops = [node for node in ast.walk(ast.parse(text)) if is_compiled(node)]
     steps = [node for loop in loops for node in ast.walk(loop) if isinstance(node, (ast.Assign, ast.AugAssign))]
-    return [
-        ast.unparse(step)
-        for step in steps
-        for target in (step.targets if isinstance(step, ast.Assign) else [step.target])
-        for place in ast.walk(target)
-        if isinstance(place, ast.Subscript) and any(isinstance(node, ast.Slice) for node in ast.walk(place.slice))
-        if isinstance(step, ast.AugAssign) or not is_number(step.value)
-    ]
+    return [ast.unparse(step) for step in steps if fills_a_part(step)]
 
 
 def test_what_is_dear_is_found():
     text = "@njit(cache=True)\ndef loop(a):\n    return np.linalg.solve(a, a)\ndef other(a):\n    return np.median(a)"
     assert dear_in(text) == ["np.linalg.solve"]
     text = "@njit\ndef loop(a, b):\n    a[0, :] = b\n    a[:, 1] *= 2.0\n    a[1:, :] = -np.nan\n    a[0, 0] = b[0]"
-    assert parts_filled_in(text) == ["a[0, :] = b", "a[:, 1] *= 2.0"]
+    text += "\n    a[1] = 1.0, 2.0\n    a[1, 0], b[1] = 1.0, 2.0"
+    assert parts_filled_in(text) == ["a[0, :] = b", "a[:, 1] *= 2.0", "a[1] = (1.0, 2.0)"]
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if "njit" in path.read_text(encoding="utf-8")], ids=str)

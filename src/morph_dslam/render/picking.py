@@ -108,7 +108,7 @@ def _nearest(nodes, triangles, rays, order, starts, corner, size):
                 found[ray], nearest[ray] = t, inverse_range
                 of_a, of_b, of_c = max(of_a, 0.0), max(of_b, 0.0), max(of_c, 0.0)
                 total = of_a + of_b + of_c
-                weights[ray] = of_a / total, of_b / total, of_c / total
+                weights[ray, 0], weights[ray, 1], weights[ray, 2] = of_a / total, of_b / total, of_c / total
     return found, weights
 
 

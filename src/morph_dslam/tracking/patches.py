@@ -227,7 +227,7 @@ def compare_patches(first, second, first_points, second_points, half):
         _normal_equations(a, b, half, sums, products)
         inverse = _step(sums, products, half, step)
         if inverse < np.inf:
-            places[j] += step
+            places[j, 0], places[j, 1] = places[j, 0] + step[0], places[j, 1] + step[1]
             spread[j] = np.sqrt(_worst_quarter(a, b, size) * inverse)
     return places, correlation, spread
 
