@@ -12,7 +12,9 @@ import morph_dslam as md
 from morph_dslam.render.rasteriser import rasterise
 from morph_dslam.sources import Frame
 from morph_dslam.tracking import views
+from morph_dslam.tracking.depth import DEPTH_WINDOW
 from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 from tests.integration.test_outline_beside_texture import CAMERA as BEFORE_BLOCK, SpottedFilm, state as block_state
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.clicked import clicked
@@ -106,6 +108,30 @@ def test_points_are_looked_for_where_they_are_and_not_where_the_correction_has_t
     shift = np.sqrt(np.mean(np.sum(tracker.last_correction.shift**2, axis=1)))
     assert shift > 0.8
     assert max(off[1:]) < 0.3 * shift
+
+
+def test_depths_that_tell_nothing_of_the_clicks_are_corrected_by_what_an_outline_tells(monkeypatch):
+    """Clicks have put the points elsewhere on the surface, where it has another depth: four deviations of a depth."""
+    monkeypatch.setattr(SystematicErrors, "told_by_depths", False)  # as where frames with depths have made the view
+    scene = Scene("block", 0)
+    frame = scene.frame(0.0)
+    known = clicked(scene.model, scene.camera, scene.state(0.0), scene.rng, 2.0)
+    options = md.TrackerOptions(least_inliers=16, new_views=False, use_depth=True, use_outline=True)
+    tracker = md.Tracker(scene.model, scene.camera, known, options, reference=frame.image)
+    tracker.track(frame)
+    assert tracker.last_measured is not None
+    depths, correction = tracker.last_measured.depths, tracker.last_correction
+    assert depths is not None
+    assert correction is not None
+    assert correction.nearer is not None
+    measured = depths.depths.copy()
+    measured[: len(correction.nearer)] += correction.nearer
+    exact = tracker.last_measured.points.in_camera(scene.state(0.0))[:, 2]
+    rows = depths.weights > 0.0
+    sigma = SIGMA_AT_1M * exact[rows] ** 2 * ALIKE_PX / DEPTH_WINDOW
+    off, before = (np.sqrt(np.mean(((given - exact)[rows] / sigma) ** 2)) for given in (depths.depths, measured))
+    assert before > 4.0
+    assert off < 1.6
 
 
 def test_a_distance_by_depths_stays_as_uncertain_as_these_are():

@@ -31,7 +31,7 @@ from morph_dslam.tracking.outline_weight import (
     near_products,
 )
 from morph_dslam.tracking.reference import ReferenceView
-from morph_dslam.tracking.reference_correction import CorrectionCheck, reference_correction
+from morph_dslam.tracking.reference_correction import CorrectionCheck, ReferenceCorrection, reference_correction
 from morph_dslam.tracking.refinement import EFFECTIVE_POINTS
 from morph_dslam.tracking.state import BoundPoints
 from morph_dslam.tracking.systematic_errors import SystematicErrors
@@ -103,6 +103,8 @@ class BesideTexture:
         if ratio is None or not 1.0 / MOST_TIMES < ratio < MOST_TIMES:
             return replace(attempt, depth_unused=DepthNotUsed(ratio))
         attempt = replace(attempt, depths=depths.padded(len(self.reference.all_points)))
+        if systematic is not None and attempt.correction is not None:
+            attempt = _with_depths_corrected(attempt, attempt.correction, systematic)
         tells = systematic is not None and systematic.told_by_depths
         if tells and self._makes_good(systematic, self._depth_check):
             found, minimum = self._corrected(attempt, attempt.estimate.state, systematic, self.scout)
@@ -269,6 +271,20 @@ class BesideTexture:
             weights = np.concatenate([weights, seen.weights])
         common_px = 0.0 if seen is None else self.balance.common_px
         return Observations(points, pixels, weights, normals, correlation, depths, common_px)
+
+
+def _with_depths_corrected(
+    attempt: PoseHypothesis, correction: ReferenceCorrection, systematic: SystematicErrors
+) -> PoseHypothesis:
+    """The attempt whose depths are corrected, as its points are, by what an outline has told of the reference's error.
+
+    The points lie where the reference state has them on the surface: what moves them there moves both.
+    """
+    estimate, rows = attempt.estimate, slice(len(attempt.inliers))
+    asked = estimate.state, estimate.residuals[rows], attempt.weights, attempt.point_depths
+    depths = systematic.pushed_texture(*asked).depths
+    assert depths is not None
+    return replace(attempt, correction=replace(correction, nearer=depths.metres @ correction.found))
 
 
 def weighed_by_residuals(depths: PointDepths, residuals: Array, pixels: Array) -> PointDepths:
