@@ -22,6 +22,7 @@ from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator, LinearCost
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import position_std
+from morph_dslam.tracking.reference_correction import ReferenceCorrection
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, ReferenceMisfit
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import moved, pose_increment
@@ -112,6 +113,41 @@ def test_what_the_deformation_moves_points_by_is_off_as_predicted(model, estimat
         predicted = columns.sum(axis=2)
         predicted *= np.sign(np.sum(predicted * wrong))
         assert np.linalg.norm(predicted - wrong) < 0.15 * np.linalg.norm(wrong), k
+
+
+def test_what_the_deformation_moves_corrected_points_by_is_off_as_stated(model, estimator, pixels):
+    """Over registrations of which corrections leave a fifth in some directions, by the covariance of draws.
+
+    What is left has the state off, and the points lie where all of the error has put them: the two are alike only by
+    what is left.
+    """
+    rng, size, n_draws, pixels = np.random.default_rng(5), 9, 80, pixels[::2]
+    turned = np.linalg.qr(rng.standard_normal((size, size)))[0]
+    shares = np.where(np.arange(size) % 2, 0.2, 0.05)
+    left, noise = ((turned * np.sqrt(some)) @ turned.T for some in (shares, shares / (1.0 - shares)))
+    covariance = np.diag((0.1 * SPREAD) ** 2)
+    factors = error_factors_of(covariance, estimator.scale)
+    true_points, weights = bound(model, REFERENCE, pixels), np.ones(len(pixels))
+    seen, errors = (
+        CAMERA.project(true_points.in_camera(LATER)),
+        errors_of(estimator, true_points, REFERENCE, covariance),
+    )
+    texture, wrong = errors.pushed_texture(LATER, 0.0 * pixels, weights), []
+    for _ in range(n_draws):
+        true = rng.standard_normal(size)
+        found = (np.eye(size) - left @ left) @ (true + noise @ rng.standard_normal(size))
+        points = bound(model, moved(REFERENCE, factors @ true), pixels)
+        shift = np.einsum("pkn,n->pk", texture.frame.jacobian, texture.transfer @ found)
+        state = estimator.estimate(points, seen - shift, weights, LATER).state
+        wrong.append((by_deformation(points, state) - by_deformation(true_points, LATER)).ravel())
+    correction = ReferenceCorrection(np.zeros(size), 0.0 * pixels, texture.transfer, left, np.zeros((size, size)))
+    exact = estimator.estimate(true_points, seen, weights, LATER)
+    errors.added(exact, weights, 0.0, learns=False, corrected=correction)
+    columns = errors.deformation_errors(exact.state, np.zeros((size, size)), None)().reshape(2 * len(pixels), -1)
+    directions, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    seen_well = sizes > 0.01 * sizes[0]
+    ratios = np.mean((np.array(wrong) @ directions[:, seen_well]) ** 2, axis=0) / sizes[seen_well] ** 2
+    assert ratios == pytest.approx(1.0, abs=0.5), "a mean square of so many draws is off by 0.16, a deviation"
 
 
 def test_the_images_make_no_error_of_the_model_good_in_a_parameter_that_a_sensor_tells(model, pixels):

@@ -199,6 +199,7 @@ class SystematicErrors:
         self._by_reference = np.zeros((size, n_factors))
         self._by_outline, self.with_outline, self.with_scale = np.zeros((size, 3)), np.zeros((size, 3)), np.zeros(size)
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
+        self._corrected: ReferenceCorrection | None = None
 
     def unexplained(self, estimate: Estimate, used: NDArray[np.bool_]) -> Unexplained:
         """What the model leaves of the residuals of the points ``used`` (p,)."""
@@ -313,7 +314,7 @@ class SystematicErrors:
             by_blur = self.pushed_by_blur(frame, np.eye(len(gain)), gain, blurred)
             covariance += by_blur @ by_blur.T
         if keeps:
-            self._by_reference, self._by_model = by_reference, by_model
+            self._by_reference, self._by_model, self._corrected = by_reference, by_model, corrected
             self._by_outline, self.with_outline = by_outline, with_outline
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
@@ -458,9 +459,9 @@ class SystematicErrors:
     ) -> Callable[[], Array]:
         """By how much what the deformation moves the pixels by (p, 2, c) may be off in the last frame that was kept.
 
-        The columns are the error factors of the reference, in their deviations, those of the model and the
-        displacement's modes. Where nothing but the images tells of the parameters, these make the model's good. Few
-        frames are asked: all is computed when one is.
+        The columns are the error factors of the reference, in their deviations (of corrected points what is left of
+        them, and what was made good), those of the model and the displacement's modes. Where nothing but the images
+        tells of the parameters, these make the model's good. Few frames are asked: all is computed when one is.
 
         Parameters
         ----------
@@ -469,12 +470,14 @@ class SystematicErrors:
         of_model : at parameters (d,), changes of them (d, k) that move the surface as errors of the model do, SI, and
             what no parameters make good of the displacement, root mean square length, metres; None without.
         """
-        return partial(self._of_deformation, state, self._widening * self._by_reference, by_known, of_model)
+        by_reference = self._widening * self._by_reference
+        return partial(self._of_deformation, state, by_reference, self._corrected, by_known, of_model)
 
     def _of_deformation(
         self,
         state: State,
         by_reference: Array,
+        corrected: ReferenceCorrection | None,
         by_known: Array,
         of_model: Callable[[Array], tuple[Array, float]] | None,
     ) -> Array:
@@ -492,7 +495,14 @@ class SystematicErrors:
         if self._moved is not None:
             pixels = self._estimator.camera.project(state.camera_from_object.apply(self._corners.rest))
             at_rest = _warped_motions(pixels, self._inverse_edges, self._moved)
-            of_reference += self.reference_factor * (at_rest - self._warped(state, self._moved))
+            slid = self.reference_factor * (at_rest - self._warped(state, self._moved))
+            if corrected is None:
+                of_reference += slid
+            else:
+                # What is left of the reference's error has the state off. The points stay where all of it has put them.
+                of_reference = np.concatenate(
+                    [of_reference + slid @ corrected.left, slid @ corrected.made_good], axis=2
+                )
         not_made_good = by_state @ by_known[:, : len(changes)] @ changes
         return np.concatenate([of_reference, not_made_good, all_columns[:, :, d : d + m]], axis=2)
 
