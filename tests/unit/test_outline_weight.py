@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from morph_dslam.model import SurfacePoints
-from morph_dslam.tracking.estimator import BoundPoints
+from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estimator
+from morph_dslam.tracking.noise import Observations, block_diagonal, window_correlation
 from morph_dslam.tracking.outline import OutlineMeasurement
 from morph_dslam.tracking.outline_weight import OutlineBalance, mean_square
+from morph_dslam.tracking.sequence_filter import SequenceFilter
+from morph_dslam.tracking.state import pose_increment
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.measured_points import bound_points, rim
+from tests.support.rendered_sequence import CAMERA, sheet_state
 
 #: How many points an outline has.
 N_OUTLINE = 200
@@ -25,6 +30,43 @@ def test_an_estimate_errs_by_the_mean_square_of_its_points_not_by_their_median()
         said.append(mean_square((residuals - rows @ off[-1]).reshape(-1, 2), weights, 3))
     expected = np.mean(said) * np.trace(gain @ gain.T)
     assert np.mean(np.sum(np.square(off), axis=1)) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize(("spread", "length"), [(0.5, 30.0), (0.02, 5.0)])
+def test_a_point_that_counts_for_less_than_its_variance_says_is_not_stated_to_err_more(spread, length):
+    """Because its neighbours err alike, or as nothing is known better than by a tenth of a pixel.
+
+    The covariance of draws is that which is stated of an estimate from points of 0.1 pixels and the rim.
+    """
+    rng, of_points, there, n_draws = np.random.default_rng(5), 0.1, sheet_state(0.5), 100
+    model = bent_sheet_model(22, 16)
+    points, (outline, places, normals) = bound_points(model, 60), rim(model, CAMERA, there)
+    exact, n, balance = CAMERA.project(points.in_camera(there)), len(outline), OutlineBalance()
+    seen = OutlineMeasurement(outline, places, normals, np.ones(n, dtype=bool), np.ones(n))
+    alike = np.exp(-np.linalg.norm(places[:, None] - places, axis=2) / length)
+    root = spread * np.linalg.cholesky(alike + 1e-9 * np.eye(n))
+
+    def off_by():
+        across = root @ rng.standard_normal(n)
+        return of_points * rng.standard_normal(exact.shape), across[:, None] * normals
+
+    for _ in range(60):
+        of_texture, of_outline = off_by()
+        balance.texture.learn(exact, of_texture, of_points**2)
+        balance.learn_outline(seen, of_outline, 0.0)
+    seen, joined = seen.weighted(balance.weight), points.joined(outline)
+    weights, directions = np.concatenate([np.ones(60), seen.weights]), np.concatenate([0.0 * exact, normals])
+    correlation = block_diagonal([window_correlation(exact, 1), balance.correlation(seen)])
+    estimator, sizes = Estimator(model, CAMERA, EstimationOptions(huber_px=50.0)), []
+    for _ in range(n_draws):
+        of_texture, of_outline = off_by()
+        pixels = np.concatenate([exact + of_texture, places + of_outline])
+        frame = Observations(joined, pixels, weights, directions, correlation)
+        found = SequenceFilter(estimator, []).fuse(frame, estimator.fit(frame, there))
+        pose = pose_increment(there.camera_from_object, found.state.camera_from_object)
+        away = np.concatenate([found.state.parameters - there.parameters, pose])
+        sizes.append(away @ np.linalg.solve(found.covariance, away) / len(away))
+    assert np.mean(sizes) == pytest.approx(1.0, abs=0.15), "the mean of so many is off by 0.05, a deviation"
 
 
 @pytest.fixture(scope="module")

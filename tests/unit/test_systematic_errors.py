@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morph_dslam.model import SurfacePoints
 from morph_dslam.tracking.binding import bind_pixels, view_of
 from morph_dslam.tracking.covariance import (
     ALIKE_SHARE,
@@ -29,7 +28,7 @@ from morph_dslam.tracking.state import moved, pose_increment
 from morph_dslam.tracking.still import held
 from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
 from tests.support.bent_sheet import bent_sheet_model
-from tests.support.measured_points import measured
+from tests.support.measured_points import measured, rim
 from tests.support.rendered_sequence import CAMERA, sheet_state
 
 REFERENCE, LATER = sheet_state(0.1), sheet_state(0.6)
@@ -342,20 +341,6 @@ def test_an_error_of_the_reference_stays_in_a_shared_parameter_as_predicted(mode
         assert stated.parameter_std[0] == pytest.approx(off_by, rel=0.1), time
 
 
-def rim(model, state):
-    """The sheet's rim as points of an outline, their places in the image, and the normals there (p, 2)."""
-    half = np.abs(model.nodes[:, :2]).max(axis=0)
-    on_rim = np.abs(model.nodes[:, :2]) > half - 1e-9
-    nodes = np.flatnonzero(on_rim.any(axis=1))
-    triangles, corners = np.array([np.argwhere(model.triangles == node)[0] for node in nodes]).T
-    points = BoundPoints.from_surface(model, SurfacePoints(triangles, np.eye(3)[corners]))
-    outwards = 1e-3 * np.where(on_rim[nodes], np.sign(model.nodes[nodes, :2]), 0.0)
-    turned = np.column_stack([outwards, np.zeros(len(nodes))]) @ state.camera_from_object.rotation.T
-    places, beside = (CAMERA.project(points.in_camera(state) + step) for step in (0.0, turned))
-    normals = (beside - places) / np.linalg.norm(beside - places, axis=1)[:, None]
-    return points, places, normals
-
-
 @pytest.mark.parametrize("other", ["depth", "outline"])
 def test_what_holds_an_estimate_beside_its_points_holds_it_against_the_reference_s_error(
     model, estimator, pixels, other
@@ -363,7 +348,7 @@ def test_what_holds_an_estimate_beside_its_points_holds_it_against_the_reference
     """By exact measurements: the estimate moves as stated."""
     true_points, n = bound(model, REFERENCE, pixels), len(pixels)
     seen, depths, of_outline = CAMERA.project(true_points.in_camera(LATER)), None, None
-    beside, places, normals = rim(model, LATER)
+    beside, places, normals = rim(model, CAMERA, LATER)
     steps = np.diag([2e-4, 2e-3, 5e-4, 3e-4, 3e-4, 3e-4, 2e-4, 2e-4, 1e-3])
     for step in steps[[1, 3, 6, 8]]:
         off = moved(REFERENCE, step)

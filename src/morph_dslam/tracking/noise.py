@@ -28,9 +28,10 @@ class Observations:
     ----------
     points : p of them
     pixels : (p, 2) as measured
-    weights : (p,), inverse variances up to a factor.
+    weights : (p,), inverse variances up to a factor, but for what ``correlation`` says.
     normals : (p, 2), zero for points that count in both directions; see `reprojection.linearise`.
-    correlation : (p, p) of the errors of the points' measurements; empty where nobody asks for it.
+    correlation : (p, p) of the errors of the points' measurements; empty where nobody asks for it. On its diagonal is
+        how many times as large as its weight says a point's variance is.
     depths : where a depth camera saw them.
     common_px : what the points with normals may be off by together, a standard deviation, pixels: by a shift in either
         direction, and by one outwards; the same in all frames.
@@ -196,7 +197,9 @@ class PixelNoise:
         ``taken`` is how many numbers' worth of variance the estimate has taken up.
         """
         used = (measured.weights > 0.0) & np.isfinite(residuals).all(axis=1)
-        numbers = measured.numbers[used].sum()
+        # How many numbers each point gives, by the variance that they have at weight 1.
+        worth = measured.numbers * measured.correlation.diagonal()
+        numbers = worth[used].sum()
         # In what a point of weight 1 is off by.
         residuals = np.where(used[:, None], np.sqrt(measured.weights)[:, None] * residuals, np.nan)
         total = max(np.nansum(residuals**2) / max(numbers - taken, LEAST_LEFT * numbers, 1), LEAST_SPREAD_PX**2)
@@ -204,7 +207,7 @@ class PixelNoise:
             products = residuals * self._before
             pairs = np.isfinite(products).all(axis=1)
             # A point of an outline is off across it alone: its pair of products is that of one number.
-            self._count = self._fade * self._count + measured.numbers[pairs].sum()
+            self._count = self._fade * self._count + worth[pairs].sum()
             self._product = self._fade * self._product + np.nansum(products)
         self._before = residuals
         # As long as there is nothing to compare with, all of it is taken to stay.

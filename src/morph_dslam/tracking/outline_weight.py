@@ -120,9 +120,16 @@ class OutlineBalance:
         return whole_deviation(self.outline.variance)
 
     def correlation(self, seen: OutlineMeasurement) -> scipy.sparse.csr_array:
-        """Of the errors (p, p) of the outline's points; those that do not count have none in common."""
-        count = len(seen.pixels)
-        return scipy.sparse.csr_array(_alike(seen.pixels, seen.valid, self.outline.length), shape=(count, count))
+        """Of the errors (p, p) of the outline's points; those that do not count have none in common.
+
+        As of `Observations`: beside texture a point's variance is not what its weight says. That is less by as much as
+        neighbours err alike, which counts here, and no more than `LEAST_SPREAD_PX` allows.
+        """
+        count, said = len(seen.pixels), 1.0
+        if not (np.isnan(self.texture.variance) or np.isnan(self.outline.variance)):
+            weight = float(seen.weights.max(initial=0.0))  # the same for all that count
+            said = weight * self.outline.variance / self.texture.variance
+        return scipy.sparse.csr_array(_alike(seen.pixels, seen.valid, self.outline.length, said), shape=(count, count))
 
     def suppose_exact_outline(self, seen: OutlineMeasurement) -> bool:
         """Begin with an outline as exact as one can be, if enough points can tell then how exact it is.
@@ -208,8 +215,11 @@ def mean_square(residuals: Array, weights: Array, n_unknowns: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _alike(pixels, counts, length):
-    """Values, columns and beginnings of the rows of exp(-d / length) of pairs that count, and ones on the diagonal."""
+def _alike(pixels, counts, length, variance):
+    """Values, columns and beginnings of the rows of variance exp(-d / length) of pairs that count.
+
+    Others have ones on the diagonal.
+    """
     rows = np.flatnonzero(counts)
     begins = np.zeros(len(pixels) + 1, np.int32)
     for i in range(len(pixels)):
@@ -220,11 +230,11 @@ def _alike(pixels, counts, length):
             columns[begins[i]] = i
     for a in range(len(rows)):
         i = rows[a]
-        columns[begins[i] + a] = i
+        values[begins[i] + a], columns[begins[i] + a] = variance, i
         for b in range(a):
             j = rows[b]
             squared = (pixels[i, 0] - pixels[j, 0]) ** 2 + (pixels[i, 1] - pixels[j, 1]) ** 2
-            alike = np.exp(-np.sqrt(squared) / length)
+            alike = variance * np.exp(-np.sqrt(squared) / length)
             values[begins[i] + b] = values[begins[j] + a] = alike
             columns[begins[i] + b], columns[begins[j] + a] = j, i
     return values, columns, begins
