@@ -74,7 +74,7 @@ class UnknownLoads:
     inward : whether they are pressures, whose coefficients are not negative.
     nodes : (k,) that have a traction.
     tractions : (k, 3, m), N per undeformed square metre and unit of each coefficient, object frame.
-    resultants : (m, 6) force, N, and moment about the origin, N m, of a unit of each.
+    resultants : (m, 6) force, N, and moment about the origin, N m, of a unit of each, on the undeformed surface.
     responses : by the name of a model's field, c m components: each of the field's c for each load, loads
         running slowest; and the `ROOT` of the compliance, J, as its upper triangle.
     second_order : of the displacement; None where it was not found, as with contact.
@@ -189,6 +189,32 @@ class LoadedFunctions(Functions):
 
 
 @dataclass(frozen=True)
+class _AndOne(Functions):
+    """The function 1, followed by other functions."""
+
+    others: Functions
+
+    @property
+    def n_functions(self) -> int:
+        return 1 + self.others.n_functions
+
+    @property
+    def n_floats(self) -> int:
+        return self.others.n_floats
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        return self.others.bounds
+
+    def _compiled(self, mu: Array) -> Array:
+        rows = self.others.rows(mu)
+        return np.hstack([np.eye(len(rows), 1), rows])
+
+    def mixed(self, matrix: Array) -> Self:
+        raise NotImplementedError("functions of loads stay as they are")
+
+
+@dataclass(frozen=True)
 class ElasticEnergy:
     """The elastic energy of unknown loads against its scale: what makes some of them likelier than others.
 
@@ -267,12 +293,16 @@ def with_unknown_loads(model: ReducedModel, work: float | None = None) -> Reduce
 
 
 def _of_tractions(model: ReducedModel, loads: UnknownLoads) -> dict[str, SeparatedField]:
-    """Responses: the tractions at all nodes, and their force and moment about the origin."""
+    """Responses: the tractions at all nodes, and their force and moment about the origin in the deformed state."""
     from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
 
     everywhere = np.zeros((len(model.nodes), loads.count, 3))
     everywhere[loads.nodes] = np.swapaxes(loads.tractions, 1, 2)
-    constant = _constant(model)
+    constant, forces = _constant(model), _nodal_forces(model, loads)
+    # A load goes with the surface as the study's parameters move it: so do the arms of its moment.
+    outer = np.moveaxis(np.tensordot(model.displacement.modes[:, loads.nodes], forces, axes=(1, 0)), 1, 2)
+    moved = outer[..., [1, 2, 0], [2, 0, 1]] - outer[..., [2, 0, 1], [1, 2, 0]]
+    moments = np.concatenate([loads.resultants[None, :, 3:], moved]).reshape(1 + len(moved), 1, -1)
 
     def response(values: Array) -> SeparatedField:
         return SeparatedField(values.reshape(1, len(values), -1), constant)
@@ -280,8 +310,17 @@ def _of_tractions(model: ReducedModel, loads: UnknownLoads) -> dict[str, Separat
     return {
         "traction": response(everywhere),
         REACTION + FORCE + LOADS: response(loads.resultants[None, :, :3]),
-        REACTION + MOMENT + LOADS: response(loads.resultants[None, :, 3:]),
+        REACTION + MOMENT + LOADS: SeparatedField(moments, _AndOne(model.displacement.functions)),
     }
+
+
+def _nodal_forces(model: ReducedModel, loads: UnknownLoads) -> Array:
+    """Forces (k, m, 3), N, at the loads' nodes of a unit of each, which add up to its resultant."""
+    forces = np.swapaxes(loads.tractions, 1, 2) * node_areas(model, loads.nodes)[:, None, None]
+    sizes = np.linalg.norm(forces, axis=2)
+    # The mesh's own integrals give the resultant, areas of triangles nearly so.
+    missing = loads.resultants[:, :3] - forces.sum(axis=0)
+    return forces + (sizes / np.maximum(sizes.sum(axis=0), 1e-300))[:, :, None] * missing
 
 
 def triangles_between(model: ReducedModel, nodes: NDArray[np.int64]) -> NDArray[np.int64]:

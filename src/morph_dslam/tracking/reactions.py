@@ -147,14 +147,19 @@ def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
     place = nothing
     if name == LOADS and model.energy is not None:
         traction, held = model.energy.traction, model.supports[name]
-        areas = node_areas(model, held)
+        areas, alone = node_areas(model, held), model.energy.model
 
         def place(mu: Array) -> tuple[Array, Array]:
             # By their squares: small tractions all over the surface would draw the mean to its middle, and where a
             # traction counts from a least size on, the place jumps with each load that passes it.
             weights = np.sum(traction.value(mu)[held] ** 2, axis=1) * areas
+            weights /= max(float(weights.sum()), 1e-300)
             positions = (model.nodes + model.displacement.value(mu))[held]
-            return weights @ positions / max(float(weights.sum()), 1e-300), np.zeros((d, 3))
+            # As the surface is moved by the study's parameters; loads have their moments to first order.
+            slopes, own = np.zeros((d, 3)), len(alone.parameters)
+            middle = np.tensordot(weights, alone.displacement.modes[:, held], axes=(0, 1))[:, None]
+            slopes[:own] = value_of(alone.displacement.with_modes(middle))(mu[:own])[1]
+            return weights @ positions, slopes
 
     elif name in model.supports:
         held = model.supports[name]
