@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+import zlib
 from dataclasses import replace
 from datetime import datetime, timedelta
 from types import SimpleNamespace
@@ -116,6 +117,28 @@ def test_images_are_turned_as_other_programs_show_them(tmp_path, orientation, tu
     assert [len(notes_of_source(source, readout)) for readout in (0.0, 0.03)] == [said - 1, said + 1]
     Image.fromarray(picture).save(tmp_path / "0.jpg")
     assert notes_of_source(open_source(tmp_path)) == ()
+
+
+@pytest.mark.parametrize("ending", ["png", "webp"])
+def test_a_narrow_strip_that_is_upside_down_is_named(tmp_path, ending):
+    """OpenCV refuses to read what a smaller size leaves no pixel of."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    picture = np.repeat(np.linspace(0, 250, 40).astype(np.uint8), 5).reshape(40, 5)
+    Image.fromarray(picture).save(tmp_path / f"0.{ending}", exif=exif)
+    shown = cv2.imread(str(tmp_path / f"0.{ending}"))[0, 0, 0] > 125  # not every version of OpenCV turns these
+    assert len(notes_of_source(open_source(tmp_path))) == int(shown)
+
+
+def test_a_picture_of_more_pixels_than_are_read_is_refused(tmp_path):
+    path = tmp_path / "0.png"
+    cv2.imwrite(str(path), np.zeros((1, 1), dtype=np.uint8))
+    data = bytearray(path.read_bytes())
+    data[16:24] = struct.pack(">2I", 100_000, 100_000)  # width and height in the header, with its checksum
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    path.write_bytes(data)
+    with pytest.raises(SourceError, match=r"0\.png cannot be decoded as an image"):
+        list(open_source(tmp_path))
 
 
 def test_a_video_that_is_upside_down_is_named(tmp_path):
