@@ -249,6 +249,8 @@ def test_damaged_registrations_are_refused(tmp_path):
         {"rivals": [{}]},
         {"frame": 4},
         {"frame": "last"},
+        {"frame": np.inf},
+        {"map_renumbered": [np.inf]},
         {"keyframes": []},
         {"keyframes": [keyframe | {"camera_from_object": [[1.0]]}]},
         {"keyframes": [keyframe | {"covariance": [[1.0]]}]},

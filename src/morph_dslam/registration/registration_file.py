@@ -64,7 +64,7 @@ def load_registration(path: str | Path, model: ReducedModel | None = None, scene
         if model is None:
             model = load_model(path.parent / content["model"])
         registration = _from_content(content, model)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
         raise RegistrationError(f"{path} is not a registration.json of `morph register` ({error})") from error
     if registration.map_registration is not None:
         _check_model(registration.map_registration, model, path)
@@ -85,7 +85,7 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
-    """From `Registration.content`; raises KeyError, TypeError, ValueError or IndexError if it is none."""
+    """From `Registration.content`; raises Key-, Type-, Value-, Index- or OverflowError if it is none."""
     facts = {key: value for key, value in content.items() if key not in _NO_FACTS}
     if facts.get("sigma_px", 0.0) is None:
         facts["sigma_px"] = np.inf
