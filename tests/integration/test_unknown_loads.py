@@ -179,11 +179,29 @@ def test_the_softest_traction_of_a_guided_block_is_uniform():
     tractions, softness = softest_tractions(surface, tangent.solve, 3)
     assert softness[0] == pytest.approx(0.04 / 2e5, rel=1e-6)
     assert softness[1] < softness[0]
-    nodal = surface.nodal(tractions[:1])[0]
-    on_top = np.isclose(mesh.nodes[:, 2], 0.04)
+    np.testing.assert_array_equal(surface.nodes, np.flatnonzero(np.isclose(mesh.nodes[:, 2], 0.04)))
     uniform = 1.0 / np.sqrt(0.03 * 0.02)
-    np.testing.assert_allclose(np.abs(nodal[on_top, 2]), uniform, rtol=1e-6)
-    np.testing.assert_allclose(nodal[~on_top], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.abs(surface.nodal(tractions[:1])[0, :, 2]), uniform, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cells", ["hex8", "hex20", "hex27", "tet10", "prism15"])
+def test_pressures_are_bumps_at_the_nodes_of_the_surface(cells):
+    """The logarithm of a Gaussian falls with the squared distance, alike for all; nothing acts below the surface."""
+    mesh = block((0.03, 0.02, 0.01), (4, 3, 2), cells)
+    problem = SolidProblem(mesh, {"all": LinearElastic(young=2e5, poisson=0.3)}, [fixed("z_min")])
+    surface = problem.loaded_surface("z_max", inward=True)
+    np.testing.assert_array_equal(surface.nodes, np.flatnonzero(np.isclose(mesh.nodes[:, 2], 0.01)))
+    pressures = -surface.nodal(pressing_tractions(surface, mesh.nodes, 6))[:, :, 2]
+    x, y, _ = 100.0 * mesh.nodes[surface.nodes].T
+    falls = []
+    for pressure in pressures:
+        seen = pressure > 1e-12
+        terms = np.column_stack([np.ones(len(x)), x, y, x**2 + y**2])[seen]
+        fall, residual, rank, _ = np.linalg.lstsq(terms, np.log(pressure[seen]), rcond=None)
+        assert (rank, seen.sum() > 8, float(residual[0]) < 1e-12) == (4, True, True)
+        falls.append(fall[3])
+    np.testing.assert_allclose(falls, falls[0], rtol=1e-6)
+    assert falls[0] < 0.0
 
 
 @pytest.mark.parametrize("cells", ["hex8", "hex20", "hex27", "tet10"])
@@ -285,8 +303,8 @@ def test_spots_do_the_work_that_loads_do_on_what_they_cause(loaded, displacement
     places = positions[farthest_points(positions, len(positions))]
     spot = np.linalg.norm(places[:, :2] - 0.03, axis=1).argmin()
     # Of the widest spots, three times as wide as the nodes are apart.
-    shape = np.exp(-0.5 * (np.linalg.norm(model.nodes[surface.on_surface] - places[spot], axis=1) / 0.0225) ** 2)
-    coefficients = np.linalg.lstsq(surface.at_nodes[surface.on_surface].toarray(), shape, rcond=None)[0][None, None]
+    shape = np.exp(-0.5 * (np.linalg.norm(model.nodes[surface.nodes] - places[spot], axis=1) / 0.0225) ** 2)
+    coefficients = (surface.from_nodes @ shape)[None, None]
     force = np.linalg.norm(surface.resultants(coefficients)[0, :3])
     moved = problem.nodal_displacement(tangent.solve(surface.loads(coefficients))[0] / force)[loads.nodes]
     work = np.einsum("n,ncm,nc->m", node_areas(model, loads.nodes), loads.tractions, moved)

@@ -46,7 +46,10 @@ class LoadedSurface:
     ----------
     dofs : (k,) scalar dofs.
     mass : sparse (k, k), integrals of the functions' products over the undeformed surface, m2.
-    at_nodes : sparse (n, k), values at the nodes of the model's mesh; zero beside the surface.
+    nodes : (s,) of the mesh that are on the surface. Functions do not vanish at all others: of elements of second order
+        they reach halfway down to the next corners.
+    at_nodes : sparse (s, k), values there.
+    from_nodes : sparse (k, s), coefficients of what has given values there.
     linear : (4, k) coefficients of the functions 1, x, y and z, the latter in metres.
     directions : (a, 3, k) unit vectors at each dof.
     n_scalar : scalar dofs of a component; those of x come first, then those of y and of z.
@@ -55,15 +58,19 @@ class LoadedSurface:
 
     dofs: NDArray[np.int64]
     mass: Any
+    nodes: NDArray[np.int64]
     at_nodes: Any
+    from_nodes: Any
     linear: Array
     directions: Array
     n_scalar: int
     n_dofs: int
 
     @classmethod
-    def of(cls, space: DisplacementSpace, region: ngs.Region, n_dofs: int, inward: bool = False) -> LoadedSurface:
-        """The functions of a displacement's component that a ``region`` sees.
+    def of(
+        cls, space: DisplacementSpace, region: ngs.Region, nodes: NDArray[np.int64], n_dofs: int, inward: bool
+    ) -> LoadedSurface:
+        """The functions of a displacement's component that a ``region`` with these ``nodes`` (s,) sees.
 
         Tractions act along the inward normal only, or in any direction.
         """
@@ -75,7 +82,8 @@ class LoadedSurface:
             parts = [_mass(scalar, region, ngs.specialcf.normal(3)[i]).diagonal()[dofs] for i in range(3)]
             directions = -np.array([parts]) / np.linalg.norm(parts, axis=0)
         linear = np.vstack([space.constant, space.coordinates.T])[:, dofs]
-        return cls(dofs, mass[dofs][:, dofs], space.node_values[:, dofs], linear, directions, scalar.ndof, n_dofs)
+        there = space.node_values[nodes][:, dofs], space.coefficients[dofs][:, nodes]
+        return cls(dofs, mass[dofs][:, dofs], nodes, *there, linear, directions, scalar.ndof, n_dofs)
 
     @property
     def _places(self) -> NDArray[np.int64]:
@@ -105,7 +113,7 @@ class LoadedSurface:
         return np.einsum("aik,cik->cak", self.directions, self._weighted(self.components(tractions)))
 
     def nodal(self, tractions: Array) -> Array:
-        """Vectors (c, n, 3) at the nodes of tractions (c, a, k)."""
+        """Vectors (c, s, 3) at the nodes of tractions (c, a, k)."""
         flat = self.at_nodes @ self.components(tractions).reshape(-1, len(self.dofs)).T
         return np.moveaxis(flat.reshape(-1, len(tractions), 3), 0, 1)
 
@@ -118,11 +126,6 @@ class LoadedSurface:
     def can_move(self, free: NDArray[np.bool_]) -> bool:
         """Whether a traction can move the surface, of whose dofs (n_dofs,) those that are not ``free`` are held."""
         return bool((np.abs(self.directions) > HELD_ACROSS)[:, free[self._places]].any())
-
-    @property
-    def on_surface(self) -> NDArray[np.int64]:
-        """The mesh's nodes that are on the surface."""
-        return np.flatnonzero(np.diff(self.at_nodes.tocsr().indptr))
 
     def compliance(self, tractions: Array, respond: Respond) -> tuple[Array, Array]:
         """Compliance (c, c) in joules of tractions (c, a, k), and the responses (c, n_dofs) to each."""
@@ -177,17 +180,14 @@ def pressing_tractions(surface: LoadedSurface, nodes: Array, count: int) -> Arra
     ----------
     nodes : (n, 3) of the model's mesh, m.
     """
-    on_surface = surface.on_surface
-    places = nodes[on_surface]
+    places = nodes[surface.nodes]
     start = places[farthest_points(places, count)]
     centres, _ = kmeans2(places, start, iter=LLOYD, minit="matrix")
     gaps, _ = KDTree(centres).query(centres, k=2)
     width = WIDTH * float(np.median(gaps[:, 1]))
     distance = np.linalg.norm(places[:, None] - centres, axis=2)
     bumps = np.exp(-((distance / width) ** 2) / 2.0)
-    # Least squares, as functions of higher order have no nodal values of their own.
-    coefficients = np.linalg.lstsq(surface.at_nodes[on_surface].toarray(), bumps, rcond=None)[0]
-    return np.ascontiguousarray(coefficients.T[:, None])
+    return np.ascontiguousarray((surface.from_nodes @ bumps).T[:, None])
 
 
 def common_tractions(surface: LoadedSurface, found: list[tuple[Array, Array]], count: int) -> Array:

@@ -165,7 +165,8 @@ class ShellProblem(SolidProblem):
         """See `SolidProblem.loaded_surface`; without a name all of the shell."""
         space = self.displacements
         region = self.geometry.boundary(name) if name else self.geometry.region("all")
-        return LoadedSurface.of(space, region, self.n_dofs, inward)
+        nodes = self.mesh.surface_nodes(name) if name else np.arange(self.mesh.n_nodes)
+        return LoadedSurface.of(space, region, nodes, self.n_dofs, inward)
 
     @cached_property
     def units(self) -> tuple[float, float]:

@@ -455,7 +455,7 @@ class SolidProblem:
     def loaded_surface(self, name: str, inward: bool) -> LoadedSurface:
         """The functions on a surface of the mesh, for tractions there along the inward normal or in any direction."""
         space, region = self.displacements, self.geometry.boundary(name)
-        return LoadedSurface.of(space, region, self.n_dofs, inward)
+        return LoadedSurface.of(space, region, self.mesh.surface_nodes(name), self.n_dofs, inward)
 
     def reactions(self, dofs: Array, mu: Array, name: str, about: Array | None = None) -> tuple[Array, Array]:
         """Force (3,) N and moment (3,) Nm that the supports of a set exert on the solid.

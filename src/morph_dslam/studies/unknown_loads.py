@@ -83,14 +83,14 @@ def reduce_unknown_loads(
     tractions = tractions[moving] / np.sqrt(energies[moving])[:, None, None]
     responses, soft = _responses(problem, surface, tractions, samples.files)
     nodal = surface.nodal(tractions)
-    nodes = np.flatnonzero(np.abs(nodal).max(axis=(0, 2)) > 0.0)
+    loaded = np.abs(nodal).max(axis=(0, 2)) > 0.0
     reduced = {name: samples.reduced(values) for name, values in responses.items()}
     second = reduced.pop(_SECOND, None)
     loads = UnknownLoads(
         section.on,
         inward,
-        nodes,
-        np.ascontiguousarray(np.moveaxis(nodal[:, nodes], 0, 2)),
+        surface.nodes[loaded],
+        np.ascontiguousarray(np.moveaxis(nodal[:, loaded], 0, 2)),
         surface.resultants(tractions),
         {name: field for name, (field, _) in reduced.items()},
         None if second is None else SecondOrder(soft, second[0]),
