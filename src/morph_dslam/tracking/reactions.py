@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from morph_dslam.model import ReducedModel, SeparatedField
 from morph_dslam.model.reduced_model import FORCE, MOMENT
-from morph_dslam.model.unknown_loads import LOADS, node_areas
+from morph_dslam.model.unknown_loads import LOADS, ElasticEnergy, node_areas
 from morph_dslam.tracking.estimator import Estimate
 from morph_dslam.tracking.observability import beyond_first_order
 
@@ -137,40 +137,54 @@ def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
     def nothing(mu: Array) -> tuple[Array, Array]:
         return np.zeros(3), np.zeros((d, 3))
 
-    def value_of(field: SeparatedField) -> _Field:
-        def of(mu: Array) -> tuple[Array, Array]:
-            value, slopes = field.value_and_sensitivities(mu)
-            return value[0], slopes[:, 0]
-
-        return of
-
-    place = nothing
+    place: _Field = nothing
     if name == LOADS and model.energy is not None:
-        traction, held = model.energy.traction, model.supports[name]
-        areas, alone = node_areas(model, held), model.energy.model
-
-        def place(mu: Array) -> tuple[Array, Array]:
-            # By their squares: small tractions all over the surface would draw the mean to its middle, and where a
-            # traction counts from a least size on, the place jumps with each load that passes it.
-            weights = np.sum(traction.value(mu)[held] ** 2, axis=1) * areas
-            weights /= max(float(weights.sum()), 1e-300)
-            positions = (model.nodes + model.displacement.value(mu))[held]
-            # As the surface is moved by the study's parameters; loads have their moments to first order.
-            slopes, own = np.zeros((d, 3)), len(alone.parameters)
-            middle = np.tensordot(weights, alone.displacement.modes[:, held], axes=(0, 1))[:, None]
-            slopes[:own] = value_of(alone.displacement.with_modes(middle))(mu[:own])[1]
-            return weights @ positions, slopes
-
+        place = _place_of_loads(model, model.energy)
     elif name in model.supports:
-        held = model.supports[name]
-        rest = model.nodes[held].mean(axis=0)
-        middle = model.displacement.modes[:, held].mean(axis=1, keepdims=True, dtype=np.float64)
-        moved = model.displacement.with_modes(middle)
-
-        def place(mu: Array) -> tuple[Array, Array]:
-            value, slopes = value_of(moved)(mu)
-            return rest + value, slopes
-
+        place = _place_of_support(model, model.supports[name])
     # A moment that never exceeds rounding is not in the file.
     moment = model.reactions.get(MOMENT + name)
-    return place, value_of(model.reactions[FORCE + name]), nothing if moment is None else value_of(moment)
+    return place, _of_one_point(model.reactions[FORCE + name]), nothing if moment is None else _of_one_point(moment)
+
+
+def _of_one_point(field: SeparatedField) -> _Field:
+    """The values (3,) and slopes (d, 3) of a field of one point."""
+
+    def of(mu: Array) -> tuple[Array, Array]:
+        value, slopes = field.value_and_sensitivities(mu)
+        return value[0], slopes[:, 0]
+
+    return of
+
+
+def _place_of_support(model: ReducedModel, held: NDArray[np.int64]) -> _Field:
+    """The mean of the deformed nodes that are held."""
+    rest = model.nodes[held].mean(axis=0)
+    middle = model.displacement.modes[:, held].mean(axis=1, keepdims=True, dtype=np.float64)
+    moved = _of_one_point(model.displacement.with_modes(middle))
+
+    def place(mu: Array) -> tuple[Array, Array]:
+        value, slopes = moved(mu)
+        return rest + value, slopes
+
+    return place
+
+
+def _place_of_loads(model: ReducedModel, energy: ElasticEnergy) -> _Field:
+    """The mean of the deformed nodes by the square of the unknown loads' traction."""
+    held, alone = model.supports[LOADS], energy.model
+    areas = node_areas(model, held)
+
+    def place(mu: Array) -> tuple[Array, Array]:
+        # By their squares: small tractions all over the surface would draw the mean to its middle, and where a traction
+        # counts from a least size on, the place jumps with each load that passes it.
+        weights = np.sum(energy.traction.value(mu)[held] ** 2, axis=1) * areas
+        weights /= max(float(weights.sum()), 1e-300)
+        positions = (model.nodes + model.displacement.value(mu))[held]
+        # As the surface is moved by the study's parameters; loads have their moments to first order.
+        slopes, own = np.zeros((len(mu), 3)), len(alone.parameters)
+        middle = np.tensordot(weights, alone.displacement.modes[:, held], axes=(0, 1))[:, None]
+        slopes[:own] = _of_one_point(alone.displacement.with_modes(middle))(mu[:own])[1]
+        return weights @ positions, slopes
+
+    return place
