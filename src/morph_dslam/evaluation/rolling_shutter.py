@@ -82,8 +82,8 @@ def shutter_notes(run: Run, frames: Iterable[int]) -> list[str]:
     if not still:
         return []
     why = (
-        "the tracker found the object anew there, or had no frame with a time of its own less than "
-        f"{MOST_GAP_S:g} s before"
+        f"the tracker found the object anew there, had no frame with a time of its own less than {MOST_GAP_S:g} s "
+        "before, or tracked it in none of the frames beside"
     )
     if run.timestamps is None or run.motion_known is None:
         why = "the run has no times, or does not say where the tracker knew"

@@ -165,7 +165,7 @@ class ShellProblem(SolidProblem):
         """See `SolidProblem.loaded_surface`; without a name all of the shell."""
         space = self.displacements
         region = self.geometry.boundary(name) if name else self.geometry.region("all")
-        nodes = self.mesh.surface_nodes(name) if name else np.arange(self.mesh.n_nodes)
+        nodes = self.mesh.surface_nodes(name) if name else np.arange(self.mesh.n_nodes, dtype=np.int64)
         return LoadedSurface.of(space, region, nodes, self.n_dofs, inward)
 
     @cached_property
