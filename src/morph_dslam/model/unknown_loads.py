@@ -189,26 +189,36 @@ class LoadedFunctions(Functions):
 
 
 @dataclass(frozen=True)
-class _AndOne(Functions):
-    """The function 1, followed by other functions."""
+class _MomentOfLoads(Functions):
+    """The three components of the loads' moment about the origin, as functions of the parameters and coefficients.
 
-    others: Functions
+    Attributes
+    ----------
+    at_rest : (m, 3) of a unit of each load on the undeformed surface, N m.
+    added : field of one point, 3 m components: what is added where the study's parameters have moved the surface.
+    """
+
+    at_rest: Array
+    added: SeparatedField
 
     @property
     def n_functions(self) -> int:
-        return 1 + self.others.n_functions
+        return 3
 
     @property
     def n_floats(self) -> int:
-        return self.others.n_floats
+        return self.at_rest.size + self.added.n_floats
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        return self.others.bounds
+        (lower, upper), open_end = self.added.functions.bounds, np.full(len(self.at_rest), np.inf)
+        return np.concatenate([lower, -open_end]), np.concatenate([upper, open_end])
 
     def _compiled(self, mu: Array) -> Array:
-        rows = self.others.rows(mu)
-        return np.hstack([np.eye(len(rows), 1), rows])
+        d, shape = self.added.functions.dimension, self.at_rest.shape
+        value, slopes = self.added.value_and_sensitivities(mu[:d], outside="linear")
+        of_each, by_parameters = self.at_rest + value.reshape(shape), slopes.reshape(d, *shape)
+        return np.vstack([mu[d:] @ of_each, np.einsum("m,dmc->dc", mu[d:], by_parameters), of_each])
 
     def mixed(self, matrix: Array) -> Self:
         raise NotImplementedError("functions of loads stay as they are")
@@ -260,7 +270,7 @@ def with_unknown_loads(model: ReducedModel, work: float | None = None) -> Reduce
     ModelFileError
         If the model has none.
     """
-    from morph_dslam.model.reduced_model import REACTION
+    from morph_dslam.model.reduced_model import MOMENT, REACTION
 
     loads = model.unknown_loads
     if loads is None:
@@ -280,6 +290,7 @@ def with_unknown_loads(model: ReducedModel, work: float | None = None) -> Reduce
         for name, response in (loads.responses | _of_tractions(model, loads)).items()
         if name != ROOT
     }
+    fields[REACTION + MOMENT + LOADS] = _moment(model, loads)
     return replace(
         model,
         parameters=(*model.parameters, *added),
@@ -293,25 +304,30 @@ def with_unknown_loads(model: ReducedModel, work: float | None = None) -> Reduce
 
 
 def _of_tractions(model: ReducedModel, loads: UnknownLoads) -> dict[str, SeparatedField]:
-    """Responses: the tractions at all nodes, and their force and moment about the origin in the deformed state."""
-    from morph_dslam.model.reduced_model import FORCE, MOMENT, REACTION
+    """Responses: the tractions at all nodes, and their force."""
+    from morph_dslam.model.reduced_model import FORCE, REACTION
 
     everywhere = np.zeros((len(model.nodes), loads.count, 3))
     everywhere[loads.nodes] = np.swapaxes(loads.tractions, 1, 2)
-    constant, forces = _constant(model), _nodal_forces(model, loads)
-    # A load goes with the surface as the study's parameters move it: so do the arms of its moment.
-    outer = np.moveaxis(np.tensordot(model.displacement.modes[:, loads.nodes], forces, axes=(1, 0)), 1, 2)
-    moved = outer[..., [1, 2, 0], [2, 0, 1]] - outer[..., [2, 0, 1], [1, 2, 0]]
-    moments = np.concatenate([loads.resultants[None, :, 3:], moved]).reshape(1 + len(moved), 1, -1)
+    constant = _constant(model)
 
     def response(values: Array) -> SeparatedField:
         return SeparatedField(values.reshape(1, len(values), -1), constant)
 
-    return {
-        "traction": response(everywhere),
-        REACTION + FORCE + LOADS: response(loads.resultants[None, :, :3]),
-        REACTION + MOMENT + LOADS: SeparatedField(moments, _AndOne(model.displacement.functions)),
-    }
+    return {"traction": response(everywhere), REACTION + FORCE + LOADS: response(loads.resultants[None, :, :3])}
+
+
+def _moment(model: ReducedModel, loads: UnknownLoads) -> SeparatedField:
+    """The loads' moment about the origin in the deformed state, N m.
+
+    A load goes with the surface as the study's parameters move it, and so do its arms. Its own displacement counts to
+    second order, and is left out.
+    """
+    modes = model.displacement.modes[:, loads.nodes]
+    outer = np.moveaxis(np.tensordot(modes, _nodal_forces(model, loads), axes=(1, 0)), 1, 2)
+    crossed = outer[..., [1, 2, 0], [2, 0, 1]] - outer[..., [2, 0, 1], [1, 2, 0]]
+    added = model.displacement.with_modes(crossed.reshape(len(modes), 1, -1))
+    return SeparatedField(np.eye(3)[:, None], _MomentOfLoads(loads.resultants[:, 3:], added))
 
 
 def _nodal_forces(model: ReducedModel, loads: UnknownLoads) -> Array:
