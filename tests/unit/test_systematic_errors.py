@@ -139,7 +139,10 @@ def test_what_the_deformation_moves_corrected_points_by_is_off_as_stated(model, 
         shift = np.einsum("pkn,n->pk", texture.frame.jacobian, texture.transfer @ found)
         state = estimator.estimate(points, seen - shift, weights, LATER).state
         wrong.append((by_deformation(points, state) - by_deformation(true_points, LATER)).ravel())
-    correction = ReferenceCorrection(np.zeros(size), 0.0 * pixels, texture.transfer, left, np.zeros((size, size)))
+    nothing = np.zeros((size, size))
+    correction = ReferenceCorrection(
+        nothing[0], 0.0 * pixels, texture.transfer, left, nothing, np.zeros(size + 3), nothing[:, :3]
+    )
     exact = estimator.estimate(true_points, seen, weights, LATER)
     errors.added(exact, weights, 0.0, learns=False, corrected=correction)
     columns = errors.deformation_errors(exact.state, np.zeros((size, size)), None)().reshape(2 * len(pixels), -1)
@@ -382,7 +385,7 @@ def test_a_state_that_was_found_beside_an_outline_is_off_with_it_and_goes_on_bei
     """All edges are too far outwards, by which the state is too near, and in another frame both have it too near."""
     estimator = Estimator(model, CAMERA, EstimationOptions(huber_px=50.0, max_iterations=50, tolerance=1e-12))
     true_points, n, off_px = bound(model, REFERENCE, pixels), len(pixels), 0.3
-    seen, (beside, places, normals) = CAMERA.project(true_points.in_camera(LATER)), rim(model, LATER)
+    seen, (beside, places, normals) = CAMERA.project(true_points.in_camera(LATER)), rim(model, CAMERA, LATER)
     step = -1e-3 * np.eye(9)[8]
     points, every = bound(model, moved(REFERENCE, step), pixels), np.ones(n + len(places))
 
