@@ -153,7 +153,7 @@ class _Normal:
         of_points, matrix, cross = self._of_points, self._matrix, self._cross
         # A ridge as part of the mean keeps the scale, which nothing determines, where it is.
         ridge = 1e-9 * of_points.trace(axis1=1, axis2=2).mean() * np.eye(3)
-        inverse = np.linalg.inv(of_points + damping * of_points * np.eye(3) + ridge)
+        inverse: Array = np.linalg.inv(of_points + damping * of_points * np.eye(3) + ridge)
         carried = cross @ inverse
         eliminated = np.tensordot(carried, cross, axes=([0, 2], [0, 2]))
         reduced = matrix + np.diag((damping + 1e-9) * np.diag(matrix)) - eliminated
@@ -169,7 +169,7 @@ class _Normal:
         ``damping`` : as a part of the diagonal.
         """
         reduced, right, inverse = self._reduced(damping)
-        step = np.linalg.solve(reduced, right)
+        step = np.asarray(np.linalg.solve(reduced, right), dtype=np.float64)
         rest = self._point_right - np.einsum("pij,i->pj", self._cross, step)
         return step[: self._n].reshape(-1, 6), np.einsum("pij,pj->pi", inverse, rest), step[self._n :]
 
