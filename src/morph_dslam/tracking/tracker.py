@@ -566,10 +566,12 @@ class Tracker:
             weights = inliers.astype(float)
             known = (estimate.state, estimate.sigma_px, hypothesis.outline)
             self.last_seen = Keyframe(found.pixels, weights, *known, found.recorded, hypothesis.point_depths)
-            if not hypothesis.outline_alone:
+            # What is before the object, or beside its place, is no part of its surface.
+            if not hypothesis.outline_alone and not self._view.recovery.doubt(hypothesis):
                 shape = self.reference.points.field.value(estimate.state.parameters)
                 depth = middle(self.reference.points.in_camera(estimate.state)[:, 2])
-                self._jumps.learn(estimate.residuals, inliers, shape, depth / self.camera.fx)
+                residuals = estimate.residuals[: len(inliers)]
+                self._jumps.learn(residuals, found.valid, inliers, shape, depth / self.camera.fx)
         self._velocity_base = estimate.state if self._lost else self._last
         self._last, self._last_by_points = estimate.state, hypothesis.points_state
         self._history.add(self._last, self._last_by_points)
