@@ -19,7 +19,13 @@ def test_the_largest_force_is_that_which_is_largest_for_certain():
         VectorEstimate.of(np.array([0.0, 3.1, 0.0]), np.full((3, 3), np.inf)),
     ]
     reactions = {"tip": [Reaction(np.zeros(3), force, none) for force in forces]}
-    run = SimpleNamespace(model=stretched_block_model(), frames=[4, 5, 6], reactions=lambda: reactions)
+    run = SimpleNamespace(
+        model=stretched_block_model(),
+        frames=[4, 5, 6],
+        reactions=lambda: reactions,
+        mistaken_frames=frozenset(),
+        torn_frames=frozenset(),
+    )
     (largest,) = largest_forces(run)
     assert (largest["frame"], largest["force_N"]) == (4, 3.0)
     del reactions["tip"][0], run.frames[0]
@@ -32,7 +38,13 @@ def test_no_force_at_all_is_as_uncertain_as_its_least_known_direction():
     assert nothing.size_std == pytest.approx(0.252)
     poke, none = VectorEstimate.of(np.array([0.0, 0.0, -0.056]), np.diag([0.01, 0.01, 0.049]) ** 2), np.zeros(3)
     reactions = {"unknown loads": [Reaction(none, force, nothing) for force in (nothing, nothing, poke)]}
-    run = SimpleNamespace(model=stretched_block_model(), frames=[0, 1, 12], reactions=lambda: reactions)
+    run = SimpleNamespace(
+        model=stretched_block_model(),
+        frames=[0, 1, 12],
+        reactions=lambda: reactions,
+        mistaken_frames=frozenset(),
+        torn_frames=frozenset(),
+    )
     (largest,) = largest_forces(run)
     assert (largest["frame"], largest["force_N"]) == (12, pytest.approx(0.056))
     assert largest["standard_deviation_N"] == pytest.approx(0.049)
@@ -45,8 +57,30 @@ def test_where_no_force_is_told_from_zero_the_largest_that_may_have_acted_is_giv
     forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), std**2 * np.ones((3, 3))) for size, std in known]
     none = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
     reactions = {"x_min": [Reaction(np.zeros(3), force, none) for force in forces]}
-    run = SimpleNamespace(model=stretched_block_model(), frames=[3, 4, 5, 6], reactions=lambda: reactions)
+    run = SimpleNamespace(
+        model=stretched_block_model(),
+        frames=[3, 4, 5, 6],
+        reactions=lambda: reactions,
+        mistaken_frames=frozenset(),
+        torn_frames=frozenset(),
+    )
     run.frames = run.frames[: len(known)]
     (largest,) = largest_forces(run)
     figures = largest["differs_from_zero"], largest["frame"], largest["force_N"], largest["standard_deviation_N"]
     assert figures == (certain, *((6, 10.0, 2.0) if certain else (4, 120.0, pytest.approx(330.0))))
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "torn", "frame"), [((), (), 6), ((6,), (), 5), ((6,), (5, 6), 4), ((4, 5), (6,), 6)]
+)
+def test_a_frame_that_is_not_to_be_relied_on_has_not_the_largest_force(mistaken, torn, frame):
+    """1 N, 2 N and 3 N; if all frames are doubtful, they have to do."""
+    none = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
+    forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), 1e-4 * np.eye(3)) for size in (1.0, 2.0, 3.0)]
+    reactions = {"tip": [Reaction(np.zeros(3), force, none) for force in forces]}
+    run = SimpleNamespace(
+        model=stretched_block_model(), frames=[4, 5, 6], reactions=lambda: reactions,
+        mistaken_frames=frozenset(mistaken), torn_frames=frozenset(torn),
+    )  # fmt: skip
+    (largest,) = largest_forces(run)
+    assert (largest["frame"], largest["force_N"]) == (frame, frame - 3.0)

@@ -117,6 +117,16 @@ def test_what_is_drawn_is_carried_along_and_coloured():
     assert not changed[:200, :100].any()
 
 
+@pytest.mark.parametrize(("show", "is_grey"), [("stress", True), ("strain", True), ("displacement", False)])
+def test_what_is_not_to_be_relied_on_has_no_colour(show, is_grey):
+    """Of displacement, which the images show, a part is right."""
+    state, picture = State(np.array([0.5, 0.0, 0.0]), ALONG_X), np.full((240, 320, 3), 90, dtype=np.uint8)
+    view = AugmentedView(stretching_block(), CAMERA, DrawOptions(show, SectionPlane.parse("-x=30")))
+    for mistaken in (False, True):
+        drawn = view.draw(picture, state, (0.0, 10.0), "", mistaken=mistaken)[36:160, 120:230].astype(int)
+        assert (np.ptp(drawn, axis=2).max() < 3) == (mistaken and is_grey)
+
+
 @pytest.mark.parametrize(("show", "of_one"), [("stress", 1.0), ("strain", 20.0)])
 def test_what_is_shown_follows_the_state(show, of_one):
     """Of u = mu X, with the stress mu MPa and the strain 0.3 mu along x, whatever was asked for before."""

@@ -21,6 +21,7 @@ from morph_dslam.extend.studies import build_rigid
 from morph_dslam.streams.messages import FrameMessage, ObjectInfo, SceneMessage
 from morph_dslam.streams.websocket import WAITING, WebSocketPublisher
 from morph_dslam.tracking.displacement_jumps import DisplacementJump
+from morph_dslam.tracking.outcomes import FewPointsAgree, TiltAmbiguous
 from tests.support.inner_structures import NODES, TRIANGLES, inner_structure, moved
 from tests.support.rendered_sequence import CAMERA
 from tests.support.streamed import (
@@ -196,6 +197,17 @@ def test_stress_near_a_crack_is_not_a_number(publisher, sink, model):
     assert at_corner.sum() == 1
     np.testing.assert_array_equal(np.isnan(values), at_corner)
     np.testing.assert_allclose(values[~at_corner], stress_at(0.1, 0.0), rtol=1e-5)
+
+
+def test_stress_of_a_frame_that_is_not_to_be_relied_on_is_not_a_number(publisher, sink, model):
+    received, found = taking(publisher), []
+    for frame, warning in enumerate([FewPointsAgree(3.0), TiltAmbiguous(0.4, 12.0)]):
+        sink(tracked_frame(frame, 0.0, block=replace(tracked_result(model, 0.1, 0.0), warnings=(warning,))))
+        found.append(next(received)["arrays"])
+    mistaken, sure = found
+    assert np.isnan(mistaken["block/scalar"]).all()
+    np.testing.assert_array_equal(mistaken["block/vertices"], sure["block/vertices"])
+    np.testing.assert_allclose(sure["block/scalar"], stress_at(0.1, 0.0), rtol=1e-5)
 
 
 def test_several_objects_by_their_names(publisher, model):

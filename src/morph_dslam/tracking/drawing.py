@@ -32,6 +32,7 @@ from morph_dslam.tracking.compilation import compile_drawing
 from morph_dslam.tracking.displacement_jumps import DisplacementJump, near_jumps
 from morph_dslam.tracking.estimator import State
 from morph_dslam.tracking.force_arrows import ForceArrows
+from morph_dslam.tracking.outcomes import may_be_mistaken
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_results import RunResults
 
@@ -276,11 +277,12 @@ class AugmentedView:
         caption: str,
         discrepancy: Discrepancy | None = None,
         jumps: Sequence[DisplacementJump] = (),
+        mistaken: bool = False,
     ) -> NDArray[np.uint8]:
         """An undistorted frame (h, w, 3) with the object over it, and in it its inner structures.
 
         The object is drawn where ``discrepancy`` has it beyond the model; stress and strain are the model's, and
-        grey near ``jumps``.
+        grey near ``jumps``, and everywhere where the result may be ``mistaken``.
         """
         displacement = self._field.displacement(state.parameters)
         if discrepancy is not None:
@@ -288,7 +290,7 @@ class AugmentedView:
         view = self._view(state, displacement)
         values = self._values(state.parameters, displacement, view)
         if self.show != "displacement":
-            values = np.where(near_jumps(jumps, self._rest), np.nan, values)
+            values = np.where(mistaken | near_jumps(jumps, self._rest), np.nan, values)
         drawn = draw_overlay(
             image,
             view.pixels,
@@ -391,7 +393,8 @@ class AugmentedPicture:
             if result.shown_state is not None
         ]
         for view, state, result in sorted(found, key=lambda one: -one[0].distance(one[1])):
-            image = view.draw(image, state, self._limits, caption, result.discrepancy, result.jumps)
+            mistaken = may_be_mistaken(result.warnings)
+            image = view.draw(image, state, self._limits, caption, result.discrepancy, result.jumps, mistaken)
         return image
 
 
@@ -401,7 +404,9 @@ MOST_STATES = 60
 
 def write_video(path: Path, source: FrameSource, camera: Camera, run: RunResults, view: AugmentedView) -> None:
     """Draw every frame of the run that the source has; hidden and lost ones are shown as they are, with the reason."""
-    known = [state for state in run.states() if state is not None]
+    # What a mistaken shape would have is not drawn.
+    mistaken, states = run.mistaken_frames, zip(run.frames, run.states(), strict=True)
+    known = [state for frame, state in states if state is not None and frame not in mistaken]
     limits = view.range_of(known[:: max(1, len(known) // MOST_STATES)])
     picture = AugmentedPicture(camera, {run.model.name: view}, limits)
     results = dict(zip(run.frames, run.results, strict=True))

@@ -128,6 +128,11 @@ class FewPointsAgree(TrackingWarning):
     spread_px: float
 
 
+def may_be_mistaken(warnings: Iterable[TrackingWarning]) -> bool:
+    """Whether a frame's result is not to be relied on at all: its deviations do not cover what may be wrong."""
+    return any(isinstance(warning, FewPointsAgree) for warning in warnings)
+
+
 @dataclass(frozen=True)
 class TiltAmbiguous(TrackingWarning):
     """A flat object far away may as well be tilted to the other side; deviations hold that.

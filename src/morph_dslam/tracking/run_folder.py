@@ -330,14 +330,17 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     """Of each support the force that is largest for certain, its standard deviation and frame; the largest one first.
 
     Where none differs from zero it is the largest one with a finite deviation, as so much may have acted; supports of
-    which that holds come last.
+    which that holds come last. Frames that are not to be relied on, or in which the surface is
+    torn, count only if there are no others.
 
     The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
     the reduction, and where it was estimated of the discretisation too.
     """
     found: list[dict[str, Any]] = []
+    doubtful = run.mistaken_frames | run.torn_frames
     for name, frames in run.reactions().items():
         known = [(reaction, frame) for reaction, frame in zip(frames, run.frames, strict=True) if reaction is not None]
+        known = [one for one in known if one[1] not in doubtful] or known
         if known:
             # A length that consists of what is not determined is no force.
             largest, frame = max(

@@ -16,7 +16,7 @@ from morph_dslam.tracking.binding import DrawnSurface
 from morph_dslam.tracking.estimator import Estimate, State
 from morph_dslam.tracking.named_points import NamedPoints
 from morph_dslam.tracking.observability import beyond_first_order, largest_displacement, largest_von_mises
-from morph_dslam.tracking.outcomes import PastForgotten, Status
+from morph_dslam.tracking.outcomes import PastForgotten, Status, may_be_mistaken
 from morph_dslam.tracking.point_rotations import Surroundings
 from morph_dslam.tracking.reactions import Reaction, Reactions, VectorEstimate
 from morph_dslam.tracking.result import STAGES, FrameResult
@@ -82,6 +82,17 @@ class RunResults:
     def tracked(self) -> NDArray[np.bool_]:
         """Frames (f,) that have an estimate."""
         return np.array([result.tracked for result in self.results], dtype=bool)
+
+    @property
+    def mistaken_frames(self) -> frozenset[int]:
+        """Numbers of frames whose results are not to be relied on."""
+        pairs = zip(self.frames, self.results, strict=True)
+        return frozenset(frame for frame, result in pairs if may_be_mistaken(result.warnings))
+
+    @property
+    def torn_frames(self) -> frozenset[int]:
+        """Numbers of frames in which the surface was found to open or slip along a line, in them or before."""
+        return frozenset(frame for frame, result in zip(self.frames, self.results, strict=True) if result.jumps)
 
     @property
     def hidden(self) -> NDArray[np.bool_]:

@@ -31,6 +31,7 @@ from morph_dslam.streams.messages import (
 )
 from morph_dslam.tracking.displacement_jumps import near_jumps
 from morph_dslam.tracking.estimator import Estimate
+from morph_dslam.tracking.outcomes import may_be_mistaken
 from morph_dslam.tracking.reactions import Reactions
 from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.sinks import TrackedFrame
@@ -205,8 +206,9 @@ class _ObjectMessages:
         if self.info.scalar is None:
             return vertices, None
         values = self._si_factor * self._field.values(mu, displacement)
-        if result.jumps and not self._covers_jumps:
-            values = np.where(near_jumps(result.jumps, self._rest), np.nan, values)
+        if not self._covers_jumps:
+            mistaken = may_be_mistaken(result.warnings)
+            values = np.where(mistaken | near_jumps(result.jumps, self._rest), np.nan, values)
         return vertices, values.astype(np.float32)
 
 

@@ -315,9 +315,12 @@ class _Job:
         run = self._run
         print("refining what is the same in the whole sequence ...", file=sys.stderr)
         placed = []
-        for part in begun:
+        for part, folder in zip(begun, self._folders, strict=True):
             end = opened[part.name].first if part.name in opened else np.inf
-            seen = [keyframe for frame, keyframe in self._seen[part.name] if frame < end]
+            known, mistaken = dict(self._seen[part.name]), folder.results.mistaken_frames
+            known = {frame: keyframe for frame, keyframe in known.items() if frame < end}
+            # No pose explains frames that are not to be relied on; without others these have to do.
+            seen = [keyframe for frame, keyframe in known.items() if frame not in mistaken] or list(known.values())
             placed.append(_refined(part, seen, run))
         with self._interrupts:  # until then the frames of the pass before are the results
             self._placed, self._views = placed, _views_of(placed, run)
