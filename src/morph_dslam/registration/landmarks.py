@@ -70,6 +70,8 @@ OFF_SIGMAS = 3.0
 SAME_SHARE = 0.02
 #: More of the depths on an object than this share do not lie behind it, if they belong to its pixels.
 SEEN_THROUGH = 0.05
+#: Parameters are one shape's if they differ by less than this share of their ranges.
+SAME_SHAPE = 1e-3
 #: Cosine of the angle between a face and the line of sight from which on the face is seen, and not from its edge.
 SEEN = 0.2
 #: Planes of faces that are nearer to a landmark than this share of the object's size may be what it is on.
@@ -314,7 +316,9 @@ def _warnings(fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None) -> lis
     if not SIZES[0] < size < SIZES[1]:
         found.append(UnusualSize(size))
     if placed.alternatives:
-        found.append(Ambiguous(Ambiguity.SHAPES, len(placed.alternatives) + 1))
+        shapes = np.array([best.state.parameters, *(state.parameters for state in placed.alternatives)])
+        is_one = (np.ptp(shapes, axis=0) <= SAME_SHAPE * (model.upper - model.lower)).all()
+        found.append(Ambiguous(Ambiguity.TILT if is_one else Ambiguity.SHAPES, len(placed.alternatives) + 1))
     # An unobservable parameter may lie anywhere; only an observable one says that the range ends too early.
     observable = best.parameter_std < model.upper - model.lower
     at_bound = zip(model.parameters, best.at_bound & observable, strict=True)

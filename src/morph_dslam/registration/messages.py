@@ -20,6 +20,7 @@ class Ambiguity(StrEnum):
     """What makes a registration ambiguous."""
 
     SHAPES = "shapes"
+    TILT = "tilt"
     BOARD_TILT = "board_tilt"
     BOARD_TAGS = "board_tags"
     TWO_PRINTS = "two_prints"
@@ -32,6 +33,9 @@ class Ambiguity(StrEnum):
 _AMBIGUITIES = {
     Ambiguity.SHAPES: "{value:.0f} different shapes fit the landmarks equally well; add landmarks away from the "
     "object's outline, or take a reference frame that shows it bent",
+    Ambiguity.TILT: "in one shape {value:.0f} poses fit the landmarks equally well, as of a flat part that is tilted "
+    "to one side or to the other; add landmarks that stand out of its plane, film it from nearer or more aslant, or "
+    "use depth or a second camera",
     Ambiguity.BOARD_TILT: "the board can be tilted the other way; show it larger or aslant",
     Ambiguity.BOARD_TAGS: "each of the board's tags may be turned by 180 degrees, as OpenCV's are against AprilTag's; "
     "show more of them, or say tag_corners in the board file",
@@ -54,8 +58,8 @@ class Ambiguous(RegistrationWarning):
     Attributes
     ----------
     why : what makes it so.
-    value : the number of shapes, the share of the second place or print, the difference in pixels, or the turn in
-        degrees.
+    value : the number of shapes, or of poses of one shape, the share of the second place or print, the difference in
+        pixels, or the turn in degrees.
     """
 
     why: Ambiguity

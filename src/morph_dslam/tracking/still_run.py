@@ -78,7 +78,9 @@ def with_still_pose(
         facts["camera"] = {term: {"value": value, "std": std} for term, (value, std) in found.terms.items()}
     warnings = tuple(w for w in registration.warnings if not isinstance(w, STILL_NOTICES))  # of the estimate before
     if found.decided:
-        warnings = tuple(w for w in warnings if not (isinstance(w, Ambiguous) and w.why is Ambiguity.SHAPES))
+        warnings = tuple(
+            w for w in warnings if not (isinstance(w, Ambiguous) and w.why in (Ambiguity.SHAPES, Ambiguity.TILT))
+        )
     warnings += tuple(still_notices(found, begun_with, part.camera))
     registration = replace(
         registration, state=found.state, covariance=found.covariance, facts=facts, warnings=warnings, alternatives=()
