@@ -378,7 +378,7 @@ def test_every_program_is_run_by_a_test():
     assert {page: count for page, count in counts.items() if count} == {
         "certificate": 1,
         "evaluation": 1,
-        "export": 1,
+        "export": 2,
         "material-tests": 1,
         "materials": 1,
         "meshes": 1,

@@ -26,6 +26,8 @@ from morph_dslam.tracking.result import FrameResult
 from morph_dslam.tracking.run_folder import write_csv, write_hdf5
 from morph_dslam.tracking.run_results import RunResults
 from tests.support.bent_sheet import bent_sheet_model
+from tests.support.documents import samples
+from tests.support.streamed import stress_at
 from tests.support.stretched_block import SHEAR_MODULUS, SIZE, YOUNG_MODULUS, stretched_block_model
 
 #: Stretch, slide (m), and the coefficients of two loads in the frames that were tracked.
@@ -88,6 +90,21 @@ def write_run(folder, model, of_study, discrepancies=False):
 @pytest.fixture
 def with_loads(tmp_path):
     return write_run(tmp_path / "run", with_unknown_loads(loaded_block()), loaded_block())
+
+
+def test_the_documented_table_along_a_line(tmp_path, monkeypatch):
+    """Of a block that is stretched and sheared evenly."""
+    write_run(tmp_path / "run", stretched_block_model(), stretched_block_model())
+    monkeypatch.chdir(tmp_path)
+    exec(compile(samples("export", "python")[1], "export", "exec"), {})
+    table = np.genfromtxt("line.csv", delimiter=",", names=True)
+    assert len(table) == 24 * len(STATES)
+    for frame, (stretch, slide, *_) in STATES.items():
+        rows = table[table["frame"] == frame]
+        np.testing.assert_allclose(rows["x_mm"], np.linspace(1.0, 47.0, 24))
+        moved = stretch * rows["x_mm"] + 1e3 * slide * 2.5e-3 / SIZE[2]
+        np.testing.assert_allclose(rows["displacement_x_mm"], moved, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(rows["von_mises_Pa"], stress_at(stretch, slide), rtol=1e-6)
 
 
 @pytest.fixture

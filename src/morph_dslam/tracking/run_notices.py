@@ -62,8 +62,9 @@ class RunWarning(StrEnum):
     )
     FEW_AGREE = (
         "few points agree, and less closely than usual, or most of them far less closely, in {count} of {n_frames} "
-        "frames, first in frame {first}: something is before the object, it deforms otherwise than the model, or it "
-        "was taken for what looks like it; do not rely on these frames"
+        "frames, first in frame {first}: something is before the object, it deforms otherwise than the model, it was "
+        "taken for what looks like it, or its points are dust or reflections on a plain surface (then take its outline "
+        "alone: --outline --no-texture); do not rely on these frames"
     )
     TILT_AMBIGUOUS = (
         "in {count} of {n_frames} frames, first in frame {first}, the object may as well be tilted to the other side, "
