@@ -40,7 +40,7 @@ LEAST_BESIDE = 12.0
 #: Landmarks no farther beside a line than this share of their spread along it have no pose to begin with.
 EXACT_LINE = 1e-4
 #: Landmarks that are right fit better by free parameters, as much as is said of, with this chance at most.
-REST_CHANCE = 1e-4
+REST_CHANCE = 1e-3
 #: Of landmarks that fit well at rest too, the surface must move by this share of the object's size: a lens or
 #: dimensions that are slightly off move it by less.
 MOVED_SHARE = 0.03
@@ -116,14 +116,15 @@ class LandmarkFit:
         """That the object is hardly at rest, as was said, where landmarks fit better otherwise; None if it may be.
 
         The statistic is F of the parameters that are set free, given the error that the landmarks show then, or that of
-        carefully set ones if that is larger. Further starts have the ``shapes`` (d,).
+        carefully set ones if that is larger. It counts squares: Huber's cost is less than these where the object does
+        not fit, and would hide that. Further starts have the ``shapes`` (d,).
         """
         estimator, points, pixels, resting = self.estimator, self.landmarks.points, self.landmarks.pixels, self.best
         model, d = estimator.model, len(estimator.model.study_parameters)
         freedom = 2 * len(points) - 6 - d
 
         def is_chance(left: float) -> bool:
-            return chance_of_better_fit(2.0 * resting.cost, left, d, freedom, self.click_px) > REST_CHANCE
+            return chance_of_better_fit(_squares(resting), left, d, freedom, self.click_px) > REST_CHANCE
 
         # The largest F, of free parameters that explain all of it, spares most fits the search.
         if not d or freedom < 1 or is_chance(0.0):
@@ -137,7 +138,7 @@ class LandmarkFit:
         motion = model.positions(best.state.parameters) - model.positions(model.default)
         moved, size = np.linalg.norm(motion, axis=1).max(), np.linalg.norm(np.ptp(model.nodes, axis=0))
         least_share = 0.0 if resting.sigma_px > self.poor_px else MOVED_SHARE
-        if is_chance(2.0 * best.cost) or moved < least_share * size:
+        if is_chance(_squares(best)) or moved < least_share * size:
             return None
         away = (best.state.parameters - model.default)[:d] ** 2 > EXCLUDED * np.diag(best.covariance)[:d]
         values = zip(model.study_parameters, best.state.parameters[:d], away, strict=True)
@@ -186,9 +187,10 @@ def fit_landmarks(
         found = _with_other_tilts(estimator, landmarks, found, click_px)
     if at_rest:
         found = [_of_pose_alone(estimator, points, pixels, estimate) for estimate in found]
-    plausible = plausible_minima(found, click_px, estimator.box.n_unknowns)
-    _check_residual(estimator, landmarks, plausible[0])
-    fit = LandmarkFit(estimator, landmarks, plausible, click_px)
+    fit = LandmarkFit(estimator, landmarks, plausible_minima(found, click_px, estimator.box.n_unknowns), click_px)
+    if (limit := _residual_above(estimator, fit.best)) is not None:
+        moved = fit.not_at_rest([] if near is not None else shape_starts(model)) if at_rest else None
+        raise _refusal(estimator, landmarks, fit.best, limit, moved)
     if fit.is_shape_known:
         _check_beside_line(fit)
     return fit
@@ -228,7 +230,8 @@ def check_at_rest(
     landmarks = BoundLandmarks(points, pixels, np.zeros(len(points), dtype=np.int64), numbers)
     estimator = _estimator(model, [RigCamera(camera, RigidTransform.identity())], landmarks, at_rest=True)
     best = _estimates(estimator, landmarks, list(pose_starts([model.default], estimator, points, pixels)))[0]
-    _check_residual(estimator, landmarks, best, HINT_RESIDUAL_SHARE)
+    if (limit := _residual_above(estimator, best, HINT_RESIDUAL_SHARE)) is not None:
+        raise _refusal(estimator, landmarks, best, limit)
 
 
 def without_parameters(covariance: Array) -> Array:
@@ -271,39 +274,59 @@ def _of_pose_alone(estimator: PointsEstimator, bound: BoundPoints, pixels: Array
     return replace(found, covariance=covariance, at_bound=np.zeros(d, dtype=bool), sigma_px=float(np.sqrt(variance)))
 
 
+def _squares(estimate: Estimate) -> float:
+    """Sum of the landmarks' squared residuals, squared pixels."""
+    return float(np.sum(estimate.residuals**2))
+
+
 def _rms(estimate: Estimate) -> float:
     """Root mean square of the landmarks' residuals, pixels."""
-    return float(np.sqrt(np.mean(np.sum(estimate.residuals**2, axis=1))))
+    return float(np.sqrt(_squares(estimate) / len(estimate.residuals)))
 
 
-def _check_residual(
-    estimator: PointsEstimator, landmarks: BoundLandmarks, best: Estimate, share: float = RESIDUAL_SHARE
-) -> None:
-    """Refuse landmarks if they do not fit to a share of the image's diagonal."""
+def _residual_above(estimator: PointsEstimator, best: Estimate, share: float = RESIDUAL_SHARE) -> float | None:
+    """The share of the image's diagonal, pixels, that landmarks fit worse than; None if they fit to that."""
     camera = estimator.camera
-    rms, limit = _rms(best), share * float(np.hypot(camera.width, camera.height))
-    if rms <= limit:
-        return
+    limit = share * float(np.hypot(camera.width, camera.height))
+    return None if _rms(best) <= limit else limit
+
+
+def _refusal(
+    estimator: PointsEstimator, landmarks: BoundLandmarks, best: Estimate, limit: float, moved: NotAtRest | None = None
+) -> RegistrationError:
+    """Why landmarks are refused that fit worse than to the ``limit``, pixels.
+
+    A load moves several landmarks, which then seem to contradict a right one: so it is named first where it explains
+    them (``moved``).
+    """
+    why = RegistrationFailure.LANDMARKS_DO_NOT_FIT
     if contradiction := cameras_contradict(estimator, landmarks.points, landmarks.pixels, best, limit, is_far=True):
-        raise RegistrationError(str(contradiction), RegistrationFailure.LANDMARKS_DO_NOT_FIT)
-    is_shape_known = _is_shape_known(estimator)
+        return RegistrationError(str(contradiction), why)
+    rms, is_shape_known = _rms(best), _is_shape_known(estimator)
+    if moved is not None:
+        return RegistrationError(
+            f"the landmarks do not fit the object at rest: their residual is {rms:.1f} px (root mean square, at most "
+            f"{limit:.1f} px). They fit with {moved.parameters}: if a load may act in this frame, leave out --at-rest "
+            "(at_rest), else check their points and pixels, and the object's dimensions",
+            why,
+        )
     wrong = _contradicted(estimator, landmarks, limit) if is_shape_known else None
     if wrong is not None:
         row, away, agreeing = wrong
-        raise RegistrationError(
+        return RegistrationError(
             f"landmark {landmarks.name(row)} is {away:.1f} px from where the other {len(landmarks) - 1} have it, which "
             f"fit the object to {agreeing:.1f} px (at most {limit:.1f} px): check its point and its pixel",
-            RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+            why,
         )
     lengths = np.linalg.norm(best.residuals, axis=1)
     worst = int(lengths.argmax())
     shape = "the object has its mesh's shape there" if is_shape_known else "the model reaches this shape"
     more = "; five or more show which of them is wrong" if is_shape_known and len(landmarks) == FEWEST_FOR_FIT else ""
-    raise RegistrationError(
+    return RegistrationError(
         f"the landmarks do not fit the object: their residual is {rms:.1f} px (root mean square, at most "
         f"{limit:.1f} px), the worst is landmark {landmarks.name(worst)} with {lengths[worst]:.1f} px; check "
         f"its pixel, the order of the landmarks, the camera file, and that {shape}{more}",
-        RegistrationFailure.LANDMARKS_DO_NOT_FIT,
+        why,
     )
 
 
