@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morph_dslam.camera import Camera
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model import Parameter, SeparatedField
 from morph_dslam.model.functions import ParameterFunctions
@@ -133,3 +134,31 @@ def test_an_undeformed_object_stays_so():
     np.testing.assert_array_equal(found.state.parameters, MODEL.default)
     np.testing.assert_array_equal(found.covariance[: len(MODEL.default)], 0.0)
     assert mean_error(MODEL, found.state, truth) < 0.3 * mean_error(MODEL, alone.state, truth)
+
+
+#: The same field in twice as many pixels, in which landmarks may be off by 8 px before they are refused.
+FINE = Camera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.fx, 2 * CAMERA.fy, 2 * CAMERA.cx, 2 * CAMERA.cy)
+
+
+@pytest.mark.parametrize(("shift_px", "is_corrected"), [(0.0, True), (12.0, False)])
+def test_an_outline_beside_landmarks_of_a_part_that_differs_from_its_mesh_does_not_decide(shift_px, is_corrected):
+    """They fit to 3.5 px and the outline has them elsewhere: that counts by squares, however far off they are."""
+    truth = replace(sheet_state(0.4), parameters=MODEL.default)
+    pose, rng = truth.camera_from_object, np.random.default_rng(2)
+    nodes = rng.choice(len(MODEL.nodes), CLICKS, replace=False)
+    pixels = FINE.project(pose.apply(MODEL.nodes[nodes])) + 3.5 * rng.standard_normal((CLICKS, 2))
+    aside = pose.translation + np.array([shift_px / FINE.fx * pose.translation[2], 0.0, 0.0])
+    image = SheetFilm(MODEL, FINE).frame(replace(truth, camera_from_object=replace(pose, translation=aside)))
+    found = register_landmarks(MODEL, FINE, Landmarks(MODEL.nodes[nodes], pixels), at_rest=True, image=image)
+    assert found.facts["corrected_by_outline"] is is_corrected
+    assert (OutlineContradicts in [type(warning) for warning in found.warnings]) is not is_corrected
+
+
+def test_a_parameter_at_rest_is_not_at_a_bound_though_its_range_begins_there():
+    arch = MODEL.parameters[0]
+    one_sided = replace(MODEL, parameters=(replace(arch, lower=arch.default), *MODEL.parameters[1:]))
+    truth = replace(sheet_state(0.4), parameters=MODEL.default)
+    image, landmarks = SheetFilm(MODEL).frame(truth), clicked(truth, 3)
+    found = register_landmarks(one_sided, CAMERA, landmarks, at_rest=True, image=image)
+    assert found.facts["corrected_by_outline"]
+    assert not any(isinstance(warning, AtBound) for warning in found.warnings)

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.model import ReducedModel
 from morph_dslam.registration.messages import OutlineContradicts, OutlineInexact, OutlineUnseen, RegistrationWarning
 from morph_dslam.registration.plausible_states import MeasuredPoints
@@ -261,24 +261,20 @@ class OutlineSnap:
         variance: float,
         redundancy: float,
     ) -> Snap:
-        k, n, ones = len(self._pixels), self._estimator.box.n_unknowns, np.ones(len(self._pixels))
+        k, n = len(self._pixels), self._estimator.box.n_unknowns
         measured = self._measured(seen, sigma, redundancy * variance)
-        alone, beside = (
-            self._estimator.evaluate(self._landmarks, self._pixels, ones, state)[0]
-            for state in (by_landmarks, estimate.state)
-        )
-        rise = 2.0 * max(beside - alone, 0.0) / self._sigma**2 / n
+        (_, alone), (cost, beside) = (self._of_landmarks(state) for state in (by_landmarks, estimate.state))
         away = np.linalg.norm(estimate.residuals[k:], axis=1)
         return Snap(
             replace(estimate, covariance=self._covariance(measured, estimate, sigma, variance)),
             measured,
-            2.0 * beside,
+            2.0 * cost,
             np.where(seen.valid, away, np.inf)[seen.expected],
             variance,
             redundancy,
-            (float(np.sqrt(2.0 * alone / k)), float(np.sqrt(2.0 * beside / k))),
+            (float(np.sqrt(alone / k)), float(np.sqrt(beside / k))),
             float(seen.valid.sum()) / max(int(seen.expected.sum()), 1),
-            float(fdtrc(n, max(2 * k - n, 1), rise)),
+            chance_of_better_fit(beside, alone, n, max(2 * k - n, 1), self._sigma),
         )
 
     def _covariance(self, measured: MeasuredPoints, estimate: Estimate, sigma: float, variance: float) -> Array:
@@ -296,6 +292,15 @@ class OutlineSnap:
         by_one_px = weighted_derivatives(*measured.points.in_state(state), estimator.camera.intrinsics, *seen)[2]
         moved_by_whole = whole_deviation(variance) * by_one_px @ inverse
         return sigma**2 * inverse + moved_by_whole.T @ moved_by_whole
+
+    def _of_landmarks(self, state: State) -> tuple[float, float]:
+        """Huber's cost of the landmarks in a state, and the sum of their squared residuals, squared pixels.
+
+        The cost is less than half of the squares where they do not fit, and would hide that they contradict.
+        """
+        ones = np.ones(len(self._pixels))
+        cost, _, _, residuals = self._estimator.evaluate(self._landmarks, self._pixels, ones, state)
+        return cost, float(np.sum(residuals**2))
 
     def _inverse(self, hessian: Array) -> Array:
         """The inverse (d + 6, d + 6) in the unknowns that are free, zero in those that are known."""
