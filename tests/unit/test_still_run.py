@@ -5,19 +5,24 @@ from threading import Event
 from time import sleep
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 import morph_dslam as md
 from morph_dslam import TrackerOptions
+from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform
 from morph_dslam.io.landmarks import Landmarks, save_landmarks
+from morph_dslam.registration.landmark_binding import bind_landmarks
 from morph_dslam.registration.registration import Registration
 from morph_dslam.tracking import still_run, track as track_module
 from morph_dslam.tracking.frame_estimation import FrameEstimation
+from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.state import State
-from morph_dslam.tracking.still_notices import PoseAwayFromLandmarks
+from morph_dslam.tracking.still import StillFit
+from morph_dslam.tracking.still_notices import LandmarksAlone, PoseAwayFromLandmarks, still_notices
 from morph_dslam.tracking.still_run import Sharpening, known_state
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
@@ -213,7 +218,35 @@ def bending(tmp_path_factory):
     }
 
 
-STALE = PoseAwayFromLandmarks(40.0, 2.0, 0.5, 3, 90.0)
+#: Of so many pixels that landmarks of a part that differs from its drawing are off by some.
+FINE = Camera(3 * CAMERA.width, 3 * CAMERA.height, 3 * CAMERA.fx, 3 * CAMERA.fy, 3 * CAMERA.cx, 3 * CAMERA.cy)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pose_in_which_landmarks_fit_much_worse_than_alone_is_named_with_what_lengths_are_off_by(seed):
+    """Of a part that differs from its drawing by 4 px, 3 % too near: twelve misses of two to three deviations each."""
+    rng, pose = np.random.default_rng(seed), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.8]))
+    points = np.ascontiguousarray(MODEL.nodes[rng.choice(len(MODEL.nodes), 12, replace=False)])
+    pixels = FINE.project(pose.apply(points)) + 4.0 * rng.standard_normal((12, 2))
+    _, rotation, translation = cv2.solvePnP(points, pixels, FINE.matrix, None)
+    alone = cv2.projectPoints(points, rotation, translation, FINE.matrix, None)[0][:, 0] - pixels
+    term = LandmarkTerm(bind_landmarks(MODEL, points), pixels, float(np.sqrt(np.sum(alone**2) / 18.0)))
+    landmarks = LandmarksAlone(term, float(np.sqrt(np.sum(alone**2) / 12.0)), n_unknowns=6)
+
+    def said(distance):
+        at = State(MODEL.default, RigidTransform(pose.rotation, np.array([0.0, 0.0, distance])))
+        return list(still_notices(StillFit(at, np.eye(9), FINE, {}), landmarks, FINE))
+
+    assert said(0.8) == []
+    (away,) = said(0.8 / 1.03)
+    assert isinstance(away, PoseAwayFromLandmarks)
+    shifted = FINE.project(pose.apply(points) - [0.0, 0.0, 0.8 - 0.8 / 1.03]) - pixels
+    assert away.off_px == pytest.approx(np.sqrt(np.mean(np.sum(shifted**2, axis=1))))
+    assert away.off_mm == pytest.approx(1e3 * away.off_px * 0.8 / 1.03 / FINE.fx)
+    assert away.length_percent == pytest.approx(-3.0, abs=1.0)
+
+
+STALE = PoseAwayFromLandmarks(40.0, 2.0, 0.5, 3, 90.0, -1.0)
 
 
 def test_an_estimate_that_rests_on_another_says_what_holds_now(bending):

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import fdtrc
 
 from morph_dslam.camera import Camera
 from morph_dslam.registration.messages import RegistrationWarning
-from morph_dslam.tracking.known_state import LandmarkTerm, StateTerm
+from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.still import TERM_STD, StillFit, corner_radius
 
-#: Landmarks that miss by more standard deviations, as root mean square, are said to; a term of the camera as well.
+#: A term of the camera that is off what was given by more standard deviations is said to be.
 MOST_DEVIATIONS = 3.0
+#: Landmarks that are right fit so much worse in the right pose than alone, as much as is said of, with this chance.
+AWAY_CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -25,22 +28,26 @@ class PoseAwayFromLandmarks(RegistrationWarning):
     ----------
     off_px : how far the landmarks are off in the pose over the sequence, root mean square.
     off_mm : the same on the object.
-    alone_px : standard deviation of their pixels as they fit alone.
+    alone_px : the same in pixels in the pose that they have alone.
     worst : number of the one that is off most, from 1.
     worst_px : by how much.
+    length_percent : by how much lengths are too large in that pose, if the landmarks are right; below zero too small.
     """
 
     template: ClassVar[str] = (
         "in the one pose for the whole sequence the landmarks are {off_px:.0f} px ({off_mm:.2g} mm) off, number "
-        "{worst} by {worst_px:.0f} px; alone they fit to {alone_px:.1f} px. The motion fits the model best there: a "
-        "support gives way, or the mesh, the law or the lens is not the real one. Places on the mesh are off by as "
-        "much; the motion of what is seen there is not"
+        "{worst} by {worst_px:.0f} px, alone {alone_px:.1f} px. The motion fits the model best there: a support gives "
+        "way, or the mesh, the law or the lens is not the real one, which then passes for a tilt. If the landmarks are "
+        "right, places on the mesh are off by as much, and lengths such as strokes by {length_percent:+.1f} %, which "
+        "the deviations do not contain: measure the part, calibrate the lens or add --refine-camera radial, and "
+        "compare with a run without --still"
     )
     off_px: float
     off_mm: float
     alone_px: float
     worst: int
     worst_px: float
+    length_percent: float
 
 
 @dataclass(frozen=True)
@@ -93,25 +100,54 @@ class RadialTermEstimated(RegistrationWarning):
 STILL_NOTICES = (PoseAwayFromLandmarks, FocalLengthEstimated, RadialTermEstimated)
 
 
-def still_notices(found: StillFit, known: LandmarkTerm | StateTerm, given: Camera) -> Iterator[RegistrationWarning]:
+@dataclass(frozen=True)
+class LandmarksAlone:
+    """Landmarks as they fit where nothing else counts.
+
+    Attributes
+    ----------
+    term : what they say of a state; its deviation is that by which they count in the pose over the sequence.
+    rms_px : by how much they are off then, root mean square.
+    n_unknowns : how many they were fitted by.
+    """
+
+    term: LandmarkTerm
+    rms_px: float
+    n_unknowns: int
+
+    def away(self, found: StillFit) -> PoseAwayFromLandmarks | None:
+        """That the pose over the sequence is away from them; None where errors of clicks may do that.
+
+        The statistic is F: what the squares rise by, for each of the unknowns, in the landmarks' variance, which their
+        own residuals have shown. In the right pose these rise by no more than their errors have taken up before.
+        """
+        term, k = self.term, len(self.term.recorded)
+        off = term.sigma_px * term.away(found.camera, found.state)
+        lengths, freedom = np.linalg.norm(off, axis=1), 2 * k - self.n_unknowns
+        off_px = float(np.sqrt(np.mean(lengths**2)))
+        rise = max(k * (off_px**2 - self.rms_px**2), 0.0) / self.n_unknowns / term.sigma_px**2
+        if freedom < 1 or fdtrc(self.n_unknowns, freedom, rise) > AWAY_CHANCE:
+            return None
+        drawn = found.camera.undistort_pixels(term.recorded) + off
+        drawn, seen = (pixels - pixels.mean(axis=0) for pixels in (drawn, drawn - off))
+        length_percent = 100.0 * (float(np.sum(drawn * seen) / np.sum(drawn**2)) - 1.0)
+        off_mm = 1e3 * off_px / found.camera.fx * float(found.state.camera_from_object.translation[2])
+        worst = int(lengths.argmax())
+        return PoseAwayFromLandmarks(off_px, off_mm, self.rms_px, worst + 1, float(lengths[worst]), length_percent)
+
+
+def still_notices(found: StillFit, landmarks: LandmarksAlone | None, given: Camera) -> Iterator[RegistrationWarning]:
     """What a reader must know of a pose over a sequence, and of the camera's terms.
 
     Parameters
     ----------
     found : the pose and the terms.
-    known : what the registration rests on that it began with.
+    landmarks : that the registration began with; None where it began otherwise.
     given : the camera as its file has it.
     """
-    if isinstance(known, LandmarkTerm):
-        deviations = np.linalg.norm(known.away(found.camera, found.state), axis=1)
-        # Of a coordinate, as the standard deviation is.
-        rms = float(np.sqrt(np.mean(deviations**2) / 2.0))
-        if rms > MOST_DEVIATIONS:
-            worst = int(deviations.argmax())
-            off_px = float(np.sqrt(np.mean(deviations**2))) * known.sigma_px
-            off_mm = 1e3 * off_px / found.camera.fx * float(found.state.camera_from_object.translation[2])
-            worst_px = float(deviations[worst]) * known.sigma_px
-            yield PoseAwayFromLandmarks(off_px, off_mm, known.sigma_px, worst + 1, worst_px)
+    away = None if landmarks is None else landmarks.away(found)
+    if away is not None:
+        yield away
     if "focal" in found.terms:
         value, std = found.terms["focal"]
         is_far = abs(np.log(value / given.fx)) > MOST_DEVIATIONS * TERM_STD["focal"]

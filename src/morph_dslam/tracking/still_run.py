@@ -26,7 +26,7 @@ from morph_dslam.tracking.refinement import N_KEYFRAMES, Keyframe, choose_keyfra
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.rig import RigCamera
 from morph_dslam.tracking.still import CameraTerm, StillProblem, fit_still
-from morph_dslam.tracking.still_notices import STILL_NOTICES, still_notices
+from morph_dslam.tracking.still_notices import STILL_NOTICES, LandmarksAlone, still_notices
 from morph_dslam.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
@@ -58,8 +58,7 @@ def with_still_pose(
     assert isinstance(tracker, Tracker)
     names = [parameter.name for parameter in part.model.parameters]
     constant = [names.index(name) for name in part.options.per_sequence]
-    begun_with = known_state(part)
-    known = _state_term(part, _covariance_of(part)) if estimated else begun_with
+    known = _state_term(part, _covariance_of(part)) if estimated else known_state(part)
     problem = StillProblem(
         part.model,
         part.camera,
@@ -81,7 +80,7 @@ def with_still_pose(
         warnings = tuple(
             w for w in warnings if not (isinstance(w, Ambiguous) and w.why in (Ambiguity.SHAPES, Ambiguity.TILT))
         )
-    warnings += tuple(still_notices(found, begun_with, part.camera))
+    warnings += tuple(still_notices(found, _landmarks_alone(part), part.camera))
     registration = replace(
         registration, state=found.state, covariance=found.covariance, facts=facts, warnings=warnings, alternatives=()
     )
@@ -92,16 +91,32 @@ def with_still_pose(
 
 def known_state(part: PlacedObject) -> LandmarkTerm | StateTerm:
     """What an object's registration rests on: landmarks, depth, or what these and other measurements gave together."""
-    landmarks, registration = part.object.start, part.registration
-    if not isinstance(landmarks, Landmarks) or registration.facts.get("corrected_by_outline", False):
+    registration, term = part.registration, _landmark_term(part)
+    if term is None or registration.facts.get("corrected_by_outline", False):
         return _state_term(part, _covariance_of_first_frame(part))
-    # As in the registration: a few that happen to fit well, or that a wrong mesh fits, are not exact for that.
-    sigma = max(landmark_deviation(registration.facts["sigma_px"]), part.object.click_px)
-    bound = bind_landmarks(part.model, landmarks.points)
     if part.depth is None:
-        return LandmarkTerm(bound, landmarks.pixels, sigma)
+        return term
     depth = depth_term(Estimator(part.model, part.camera), registration.state, part.depth, part.options.depth_sigma)
-    return LandmarkDepthTerm(bound, landmarks.pixels, sigma, depth)
+    return LandmarkDepthTerm(term.points, term.recorded, term.sigma_px, depth)
+
+
+def _landmark_term(part: PlacedObject) -> LandmarkTerm | None:
+    """What landmarks say of the reference state; None for an object that was registered otherwise."""
+    landmarks = part.object.start
+    if not isinstance(landmarks, Landmarks):
+        return None
+    # As in the registration: a few that happen to fit well, or that a wrong mesh fits, are not exact for that.
+    sigma = max(landmark_deviation(part.registration.facts["sigma_px"]), part.object.click_px)
+    return LandmarkTerm(bind_landmarks(part.model, landmarks.points), landmarks.pixels, sigma)
+
+
+def _landmarks_alone(part: PlacedObject) -> LandmarksAlone | None:
+    """Landmarks as they fitted alone, whether or not something else has corrected the registration by them."""
+    term = _landmark_term(part)
+    if term is None:
+        return None
+    n_unknowns = 6 if part.object.at_rest else Box.of(part.model).n_unknowns
+    return LandmarksAlone(term, part.registration.facts["residual_rms_px"], n_unknowns)
 
 
 def _state_term(part: PlacedObject, covariance: Array) -> StateTerm:
