@@ -160,6 +160,16 @@ def test_a_run_by_the_outline_alone_says_why():
         assert reason in notice.text
 
 
+def test_an_outline_that_has_an_object_at_rest_deformed_is_named():
+    """By more than four deviations; texture counts from the reference frame, whatever its parameters are there."""
+    arched = frame_result([0.5e-3, 0.03, 0.0], [1e-4, 0.01, 0.01], [False] * 3)
+    for by_outline, at_rest, said in ((True, True, True), (True, False, False), (False, True, False)):
+        run = RunResults(MODEL, reference_frame=3, at_rest=at_rest)
+        run.add(3, 0.0, replace(arched, by_outline=by_outline))
+        found = [notice for notice in notices_of(run) if notice.warning is RunWarning.DEFORMED_AT_REST]
+        assert [notice.data for notice in found] == ([{"frame": 3, "values": "arch = 0.5 ± 0.1 mm"}] if said else [])
+
+
 PER_FRAME = [
     (ObjectMoved(), RunWarning.MOVED),
     (FewPointsAgree(0.5), RunWarning.FEW_AGREE),

@@ -123,9 +123,15 @@ class PlacedObject:
 
     def new_results(self, refined: bool = False) -> RunResults:
         """Results of no frame so far."""
-        angles, options = self.registration.per_sequence, self.options
         return RunResults(
-            self.model, self.frame, refined, options.per_sequence, angles, options.modulus_std, self.object.points
+            self.model,
+            self.frame,
+            refined,
+            self.options.per_sequence,
+            self.registration.per_sequence,
+            self.options.modulus_std,
+            self.object.points,
+            self.object.at_rest,
         )
 
     def new_tracker(self) -> Tracker | RigTracker:

@@ -33,7 +33,7 @@ from morph_dslam.tracking.outcomes import (
     TimeOutside,
     TrackingWarning,
 )
-from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE, FLOOR_PX, UNEXPLAINED_PX
+from morph_dslam.tracking.reference_misfit import CLEARLY_WORSE, FLOOR_PX, REFUTED, UNEXPLAINED_PX
 from morph_dslam.tracking.run_results import RunResults, contradictions
 
 _Warning = TypeVar("_Warning", bound=TrackingWarning)
@@ -55,6 +55,11 @@ class RunWarning(StrEnum):
         "the object was followed by its outline alone in {count} of {n_frames} frames, since its texture shows "
         "{corners} corners in the reference and {needed} are needed: what moves along the outline, or inside of it, is "
         "not seen"
+    )
+    DEFORMED_AT_REST = (
+        "by its outline alone the object has {values} in frame {frame}, in which it was said to be at rest "
+        "(--at-rest): the part and its drawing differ, or a load acts there. Values count from the drawing, not from "
+        "that frame: take these off for what has happened since, and measure the part"
     )
     MOVED = (
         "the object has moved from its place in the map in {count} {frames}, first in frame {first}: there its points "
@@ -227,6 +232,24 @@ def _by_outline(run: RunResults) -> list[RunNotice]:
     return [RunNotice.of(RunWarning.FEW_CORNERS, **data, corners=few[0], needed=few[1])]
 
 
+def _deformed_at_rest(run: RunResults) -> list[RunNotice]:
+    """That the outline alone, which counts from the drawing, has an object deformed that was said to be at rest."""
+    if not run.at_rest or run.reference_frame not in run.frames:
+        return []
+    row = run.frames.index(run.reference_frame)
+    estimate, model = run.results[row].estimate, run.model
+    if estimate is None or not run.results[row].by_outline:
+        return []
+    pairs = zip(estimate.state.parameters, model.default, estimate.parameter_std, strict=True)
+    values = [
+        f"{parameter.name} = {with_deviation(parameter, value, deviation)}"
+        for parameter, (value, default, deviation) in zip(model.study_parameters, pairs, strict=False)
+        if parameter.name not in run.per_sequence and abs(value - default) > REFUTED * deviation
+    ]
+    data = {"frame": run.reference_frame, "values": ", ".join(values)}
+    return [RunNotice.of(RunWarning.DEFORMED_AT_REST, **data)] if values else []
+
+
 def notices_of(run: RunResults) -> list[RunNotice]:
     """What a reader of the results must know."""
     held = _held_at_bound(run)
@@ -236,8 +259,7 @@ def notices_of(run: RunResults) -> list[RunNotice]:
         found.append(of(RunWarning.LOST, count=lost, n_frames=n_frames))
     if run.hidden.any():
         found.append(of(RunWarning.HIDDEN, count=int(run.hidden.sum()), n_frames=n_frames))
-    found += _by_outline(run)
-    found += _of_frames(run)
+    found += [*_by_outline(run), *_deformed_at_rest(run), *_of_frames(run)]
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
         found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))

@@ -44,6 +44,7 @@ class RunResults:
     revolution_angles : names of those that are angles about an axis of revolution, which go on beyond their bounds.
     modulus_std : standard deviation of a factor common to all moduli, a share.
     points : places of the object that are followed by name; None where there are none.
+    at_rest : whether the object was said to be undeformed in the reference frame.
     frames : (f,) numbers.
     timestamps : (f,) seconds.
     results : (f,), without the residuals of single points and the deviations of discrepancies: runs may be long.
@@ -56,6 +57,7 @@ class RunResults:
     revolution_angles: tuple[str, ...] = ()
     modulus_std: float = 0.0
     points: NamedPoints | None = None
+    at_rest: bool = False
     frames: list[int] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
