@@ -26,7 +26,12 @@ from morph_dslam.tracking.reference import PosedImage, ReferenceView
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.session import Session
 from morph_dslam.tracking.still import StillFit, StillProblem, fit_still, held
-from morph_dslam.tracking.still_notices import FocalLengthEstimated, FocalLengthFarFromGiven, still_notices
+from morph_dslam.tracking.still_notices import (
+    FocalLengthEstimated,
+    FocalLengthFarFromGiven,
+    LandmarksAlone,
+    still_notices,
+)
 from morph_dslam.tracking.still_run import OpenedSurface
 from morph_dslam.tracking.views import ActiveView
 from tests.support.bent_sheet import bent_sheet_model
@@ -158,7 +163,7 @@ def test_a_focal_length_is_the_same_from_wherever_it_starts(factor):
     assert abs(value - camera.fx) < 3.0 * std
     away_by = np.abs(found.state.camera_from_object.translation - pose.translation)
     assert (away_by < 3.5 * np.sqrt(np.diag(found.covariance)[-3:])).all()
-    (notice,) = still_notices(found, known, stated)
+    (notice,) = still_notices(found, LandmarksAlone(known, 0.0, 6, 1.0), stated)
     assert isinstance(notice, FocalLengthEstimated)
     assert isinstance(notice, FocalLengthFarFromGiven) == (factor == 3.0)
 
@@ -167,15 +172,16 @@ def test_a_pose_away_from_the_landmarks_is_said():
     model, camera = bent_sheet_model(43, 31), Camera(640, 480, 1500.0, 1500.0, 320.0, 240.0)
     points = model.nodes[::97]
     known = LandmarkTerm(bind_landmarks(model, points), camera.project(POSE.apply(points)), 1.0)
-    for shift, expected in ((0.0, 0), (2e-3, 0), (1e-2, 1)):
+    # Errors of a pixel, or what is of no account, are not said; 2.4 px and 12 px of all landmarks are.
+    for shift, expected, least_px in ((0.0, 0, 0.0), (8e-4, 0, 0.0), (2e-3, 0, 2.0), (2e-3, 1, 1.0), (1e-2, 1, 1.0)):
         pose = RigidTransform(POSE.rotation, POSE.translation + shift * np.array([1.0, 0.0, 0.0]))
         found = StillFit(State(model.default, pose), np.eye(len(model.default) + 6), camera, {})
-        notices = list(still_notices(found, known, camera))
+        notices = list(still_notices(found, LandmarksAlone(known, 0.0, 6, least_px), camera))
         assert len(notices) == expected
         if expected:
             # Parallel to the image, a shift is as large for all points at one depth.
-            assert notices[0].off_mm == pytest.approx(10.0, rel=0.1)
-            assert notices[0].off_px == pytest.approx(10.0 * 1.5 / 1.25, rel=0.1)
+            assert notices[0].off_mm == pytest.approx(1e3 * shift, rel=0.1)
+            assert notices[0].off_px == pytest.approx(1e3 * shift * 1.5 / 1.25, rel=0.1)
 
 
 def test_deformed_frames_decide_which_way_a_plane_is_tilted():

@@ -231,7 +231,7 @@ def test_a_pose_in_which_landmarks_fit_much_worse_than_alone_is_named_with_what_
     _, rotation, translation = cv2.solvePnP(points, pixels, FINE.matrix, None)
     alone = cv2.projectPoints(points, rotation, translation, FINE.matrix, None)[0][:, 0] - pixels
     term = LandmarkTerm(bind_landmarks(MODEL, points), pixels, float(np.sqrt(np.sum(alone**2) / 18.0)))
-    landmarks = LandmarksAlone(term, float(np.sqrt(np.sum(alone**2) / 12.0)), n_unknowns=6)
+    landmarks = LandmarksAlone(term, float(np.sqrt(np.sum(alone**2) / 12.0)), n_unknowns=6, poor_px=3.0)
 
     def said(distance):
         at = State(MODEL.default, RigidTransform(pose.rotation, np.array([0.0, 0.0, distance])))

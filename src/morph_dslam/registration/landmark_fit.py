@@ -102,8 +102,7 @@ class LandmarkFit:
     @property
     def poor_px(self) -> float:
         """Landmarks that fit worse than this are flagged."""
-        camera = self.estimator.camera
-        return max(POOR_FIT * self.click_px, POOR_SHARE * float(np.hypot(camera.width, camera.height)))
+        return poor_px(self.estimator.camera, self.click_px)
 
     @property
     def measured(self) -> MeasuredPoints:
@@ -148,6 +147,11 @@ class LandmarkFit:
         if not given:
             return None
         return NotAtRest(resting.sigma_px, self.click_px, float(np.sqrt(2.0 * best.cost / freedom)), given)
+
+
+def poor_px(camera: Camera, click_px: float) -> float:
+    """Deviation of a coordinate, pixels, from which on landmarks are flagged, where carefully set ones have another."""
+    return max(POOR_FIT * click_px, POOR_SHARE * float(np.hypot(camera.width, camera.height)))
 
 
 def fit_landmarks(

@@ -39,8 +39,8 @@ class PoseAwayFromLandmarks(RegistrationWarning):
         "{worst} by {worst_px:.0f} px, alone {alone_px:.1f} px. The motion fits the model best there: a support gives "
         "way, or the mesh, the law or the lens is not the real one, which then passes for a tilt. If the landmarks are "
         "right, places on the mesh are off by as much, and lengths such as strokes by {length_percent:+.1f} %, which "
-        "the deviations do not contain: measure the part, calibrate the lens or add --refine-camera radial, and "
-        "compare with a run without --still"
+        "the deviations do not contain: measure the part, calibrate the lens (--refine-camera radial stands in for "
+        "that), and compare with a run without --still"
     )
     off_px: float
     off_mm: float
@@ -109,11 +109,13 @@ class LandmarksAlone:
     term : what they say of a state; its deviation is that by which they count in the pose over the sequence.
     rms_px : by how much they are off then, root mean square.
     n_unknowns : how many they were fitted by.
+    poor_px : deviation of a coordinate from which on landmarks are said to fit badly; less is of no account.
     """
 
     term: LandmarkTerm
     rms_px: float
     n_unknowns: int
+    poor_px: float
 
     def away(self, found: StillFit) -> PoseAwayFromLandmarks | None:
         """That the pose over the sequence is away from them; None where errors of clicks may do that.
@@ -126,7 +128,8 @@ class LandmarksAlone:
         lengths, freedom = np.linalg.norm(off, axis=1), 2 * k - self.n_unknowns
         off_px = float(np.sqrt(np.mean(lengths**2)))
         rise = max(k * (off_px**2 - self.rms_px**2), 0.0) / self.n_unknowns / term.sigma_px**2
-        if freedom < 1 or fdtrc(self.n_unknowns, freedom, rise) > AWAY_CHANCE:
+        is_chance = freedom < 1 or fdtrc(self.n_unknowns, freedom, rise) > AWAY_CHANCE
+        if is_chance or off_px < np.sqrt(2.0) * self.poor_px:
             return None
         drawn = found.camera.undistort_pixels(term.recorded) + off
         drawn, seen = (pixels - pixels.mean(axis=0) for pixels in (drawn, drawn - off))
