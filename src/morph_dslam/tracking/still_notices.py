@@ -37,10 +37,10 @@ class PoseAwayFromLandmarks(RegistrationWarning):
     template: ClassVar[str] = (
         "in the one pose for the whole sequence the landmarks are {off_px:.0f} px ({off_mm:.2g} mm) off, number "
         "{worst} by {worst_px:.0f} px, alone {alone_px:.1f} px. The motion fits the model best there: a support gives "
-        "way, or the mesh, the law or the lens is not the real one, which then passes for a tilt. If the landmarks are "
-        "right, places on the mesh are off by as much, and lengths such as strokes by {length_percent:+.1f} %, which "
-        "the deviations do not contain: measure the part, calibrate the lens (--refine-camera radial stands in for "
-        "that), and compare with a run without --still"
+        "way, or a small error of mesh, law or lens passes for a tilt. If the landmarks are right, places on the mesh "
+        "are off by as much, and lengths such as strokes by {length_percent:+.1f} %, which the deviations do not "
+        "contain: measure the part, calibrate the lens (--refine-camera radial stands in for that), and compare with "
+        "a run without --still"
     )
     off_px: float
     off_mm: float
