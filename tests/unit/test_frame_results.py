@@ -20,8 +20,9 @@ from morph_dslam.tracking.measurement import Measurement
 from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.outcomes import FewPointsAgree
 from morph_dslam.tracking.recovery import Recovery
+from morph_dslam.tracking.reference_factors import error_factors_of
 from morph_dslam.tracking.sequence_filter import SequenceFilter
-from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 from morph_dslam.tracking.tracker import Tracker
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.rendered_sequence import CAMERA, SheetFilm, sheet_state

@@ -22,11 +22,12 @@ from morph_dslam.tracking.estimator import BoundPoints, EstimationOptions, Estim
 from morph_dslam.tracking.noise import Observations
 from morph_dslam.tracking.observability import position_std
 from morph_dslam.tracking.reference_correction import ReferenceCorrection
+from morph_dslam.tracking.reference_factors import error_factors_of
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, ReferenceMisfit
 from morph_dslam.tracking.sequence_filter import SequenceFilter
 from morph_dslam.tracking.state import moved, pose_increment
 from morph_dslam.tracking.still import held
-from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import measured, rim
 from tests.support.rendered_sequence import CAMERA, sheet_state

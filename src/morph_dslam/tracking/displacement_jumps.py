@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from morph_dslam.even_rows import evenly
 from morph_dslam.model.discrepancy import farthest_points
@@ -258,7 +258,7 @@ def _nearest(points: Array) -> NDArray[np.int64]:
     count = min(NEAREST, max(len(points) - 1, 0))
     if not count:
         return np.zeros((len(points), 0), dtype=np.int64)
-    return np.asarray(cKDTree(points).query(points, count + 1)[1][:, 1:], dtype=np.int64)
+    return np.asarray(KDTree(points).query(points, count + 1)[1][:, 1:], dtype=np.int64)
 
 
 def _surroundings(rest: Array, reach: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:

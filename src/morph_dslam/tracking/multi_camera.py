@@ -44,11 +44,11 @@ from morph_dslam.tracking.outcomes import (
     Status,
     TrackingWarning,
 )
+from morph_dslam.tracking.reference_factors import error_factors_of
 from morph_dslam.tracking.reference_misfit import Unexplained
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.rig import RigCamera, RigEstimator
 from morph_dslam.tracking.rig_errors import RigErrors
-from morph_dslam.tracking.systematic_errors import error_factors_of
 from morph_dslam.tracking.tracker import Tracker
 from morph_dslam.tracking.tracker_inputs import check_pose, check_tracker
 from morph_dslam.tracking.views import KeyframeViews

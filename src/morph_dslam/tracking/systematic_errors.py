@@ -1,14 +1,10 @@
 """Errors that more points and more frames do not average out: of the reference state, and of the model.
 
-The points were bound to the mesh in the reference view, so an error of the object's state there moves them
-on the surface, and every frame's estimate with them. Let a pixel of the reference view move by J0 e where its
-state is off by e; the material point under a fixed pixel then moves so that its pixel moves by -J0 e, in
-another view by -M J0 e, with M the map between the images of the point's triangle. The frame's estimate takes
-this for motion, H^-1 J' W M J0 e, to first order; H is that of all that it was made from, depths and an
-outline too. The depth of a point that moves on its triangle changes by the edges', and enters alike. Of points
-alone in the reference view itself that is e. What it cannot take
-up stays in the residuals; where they show more of it than the stated covariance of e explains,
-`ReferenceMisfit` says by how much that is too small.
+The points were bound to the mesh in the reference view, so an error e of the object's state there moves their pixels
+by -M J0 e in another view (`reference_factors`). The frame's estimate takes this for motion, H^-1 J' W M J0 e, to first
+order; H is that of all that it was made from, depths and an outline too. Of points alone in the reference view itself
+that is e. What it cannot take up stays in the residuals; where they show more of it than the stated covariance of e
+explains, `ReferenceMisfit` says by how much that is too small.
 
 A model that cannot take the object's shape leaves residuals that are alike over parts of the surface much
 wider than the windows that are compared. Their covariance is measured from pairs of points whose windows do
@@ -27,37 +23,19 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from morph_dslam.tracking.covariance import BoundPart, SharedErrors
-from morph_dslam.tracking.depth import PointDepths, weighted_depths
+from morph_dslam.tracking.depth import PointDepths
 from morph_dslam.tracking.depth_scale import CommonDepthScale
 from morph_dslam.tracking.estimator import BoundPoints, Estimate, Estimator, Prior, State
 from morph_dslam.tracking.linearization import Linearization, inverse_of_seen
-from morph_dslam.tracking.reference_correction import PushedDepths, PushedTexture, ReferenceCorrection
+from morph_dslam.tracking.reference_correction import PushedTexture, ReferenceCorrection
+from morph_dslam.tracking.reference_factors import ReferenceFactors
 from morph_dslam.tracking.reference_misfit import FLOOR_PX, BeyondReference, ReferenceMisfit, Unexplained
-from morph_dslam.tracking.reprojection import huber_weights, project_with_jacobian
+from morph_dslam.tracking.reprojection import project_with_jacobian
 
 Array = NDArray[np.float64]
-#: A triangle seen so much flatter in the reference view than in another says nothing of the motion there.
-LARGEST_STRETCH = 5.0
-#: Error factors smaller than this share of the largest, in units of the unknowns, say nothing of the depths' scale.
-LEAST_FACTOR = 1e-9
-
-
-def error_factors_of(covariance: Array | None, scale: Array) -> Array | None:
-    """As many error factors as unknowns (n, n) for a state of this covariance; None where it is not known.
-
-    Parameters
-    ----------
-    covariance : (n, n) of the state.
-    scale : (n,) of the unknowns, which makes them comparable.
-    """
-    if covariance is None or not np.isfinite(covariance).all():
-        return None
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
 
 
 class SystematicErrors:
@@ -94,98 +72,12 @@ class SystematicErrors:
         with_outline: Array | None = None,
     ) -> None:
         self._estimator, self._points, self._still = estimator, points, still
+        self._reference = ReferenceFactors(estimator, points, parts, scale or CommonDepthScale(), with_outline)
+        self._told_by_depths = scale is None or scale.with_state is None
         self._misfit = ReferenceMisfit()
-        self._corners = points.corners(estimator.model)
-        pixels = [estimator.camera.project(self._corners.in_camera(part.state)).reshape(-1, 3, 2) for part in parts]
-        corners = np.concatenate([found[part.rows] for found, part in zip(pixels, parts, strict=True)])
-        edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)  # as columns
-        size = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            adjugate = np.stack([edges[:, 1, 1], -edges[:, 0, 1], -edges[:, 1, 0], edges[:, 0, 0]], axis=1)
-            self._inverse_edges = (adjugate / size[:, None]).reshape(-1, 2, 2)
-        self._moved, self._factors = self._by_error_factors(parts), parts[0].error_factors
-        self._shares = np.zeros(0 if self._moved is None else self._moved.shape[2])
-        self._n_reference = len(self._shares)
-        self._scale = scale or CommonDepthScale()
-        self._take_scale(self._scale, parts)
-        self._outline_shares = self._shares_of_outline(with_outline)
         self._common = SharedErrors(self._places(parts[0].state), window)
         self.beyond_reference: BeyondReference | None = None
         self.forget_frames()
-
-    def _by_error_factors(self, parts: Sequence[BoundPart]) -> Array | None:
-        """By what each error factor moves the points' pixels (p, 2, c) in their images; None if not known."""
-        moved = []
-        for part in parts:
-            if part.error_factors is None:
-                return None
-            moved.append(self._project(part.state)[1][part.rows] @ part.error_factors)
-        return np.concatenate(moved)
-
-    def _take_scale(self, scale: CommonDepthScale, parts: Sequence[BoundPart]) -> None:
-        """Find by what share each error factor has all depths too large; their scale may be one more factor.
-
-        A reference state that was found by depths is as much too far away as these are too large: what its error
-        factors move the surface by along the pixels' sight lines, on average, is the scale's doing. Of a state that
-        frames with such depths have found it is known how far its error is the scale's.
-        """
-        if not scale.std:
-            return
-        std = scale.std
-        if scale.with_state is not None and self._factors is not None:
-            self._shares = self._shares_of_state(scale)
-            std = float(np.sqrt(max(std**2 - float(self._shares @ self._shares), 0.0)))
-        elif scale.in_reference and self._moved is not None:
-            farther = np.concatenate([self._farther(part) for part in parts])
-            mean = np.mean(farther[np.isfinite(farther).all(axis=1)], axis=0)
-            self._shares = scale.std * mean / max(float(np.linalg.norm(mean)), 1e-300)
-            return
-        p = len(self._points)
-        moved = np.zeros((p, 2, 0)) if self._moved is None else self._moved
-        self._moved = np.concatenate([moved, np.zeros((p, 2, 1))], axis=2)
-        self._shares = np.append(self._shares, std)
-        if self._factors is not None:
-            self._factors = np.column_stack([self._factors, np.zeros(len(self._factors))])
-
-    def _shares_of_state(self, scale: CommonDepthScale) -> Array:
-        """By what share each of the reference state's error factors (c,) has all depths too large.
-
-        It is no more than the scale's deviation.
-        """
-        assert scale.with_state is not None
-        found = self._by_factor(scale.with_state)
-        return found * min(1.0, scale.std / max(float(np.linalg.norm(found)), 1e-300))
-
-    def _shares_of_outline(self, with_outline: Array | None) -> Array:
-        """Covariance (c, 3) of the error factors with what the outline is off by, which is of variance one."""
-        if with_outline is None or self._factors is None:
-            return np.zeros((len(self._shares), 3))
-        left, sizes, right = np.linalg.svd(self._by_factor(with_outline), full_matrices=False)
-        return np.asarray((left * np.minimum(sizes, 1.0)) @ right)
-
-    def _by_factor(self, covariance: Array) -> Array:
-        """Covariance (c, ...) of each of the reference state's error factors with what the state's error has that of.
-
-        With the factors F of the state it is the a with F a = ``covariance`` (d + 6, ...).
-        """
-        assert self._factors is not None
-        inverse = np.linalg.pinv(self._factors / self._estimator.scale[:, None], rcond=LEAST_FACTOR)
-        return np.asarray((inverse / self._estimator.scale) @ covariance, dtype=np.float64)
-
-    def _farther(self, part: BoundPart) -> Array:
-        """By what share each error factor has the surface at the pixels of a part's points farther away (p, c)."""
-        assert self._moved is not None
-        assert part.error_factors is not None
-        count = len(self._points)
-        ahead = weighted_depths(*self._points.in_state(part.state), np.zeros(count), np.ones(count))[1]
-        along = np.einsum("pb,pbc->pc", self._per_pixel(part.state), self._moved)
-        depths = self._points.in_camera(part.state)[:, 2]
-        return np.asarray(((ahead @ part.error_factors - along) / depths[:, None])[part.rows])
-
-    def _per_pixel(self, state: State) -> Array:
-        """How much farther away the points' triangles are in a state, for each pixel of the reference view (p, 2)."""
-        corners = self._corners.in_camera(state)[:, 2].reshape(-1, 3)
-        return np.asarray(np.einsum("pa,pab->pb", corners[:, 1:] - corners[:, :1], self._inverse_edges))
 
     def _places(self, state: State) -> Array:
         """Places (p, 3) of the points in an object of this state, in pixels at its depth."""
@@ -195,8 +87,7 @@ class SystematicErrors:
     def forget_frames(self) -> None:
         """The next estimate does not rest on earlier ones, or their errors are in its covariance already."""
         size = len(self._estimator.scale)
-        n_factors = 0 if self._moved is None else self._moved.shape[2]
-        self._by_reference = np.zeros((size, n_factors))
+        self._by_reference = np.zeros((size, len(self._reference.shares)))
         self._by_outline, self.with_outline, self.with_scale = np.zeros((size, 3)), np.zeros((size, 3)), np.zeros(size)
         self._by_model = np.zeros((size, 2 * self._common.factor.shape[1]))
         self._corrected: ReferenceCorrection | None = None
@@ -268,40 +159,34 @@ class SystematicErrors:
         """
         frame = self.linearized(estimate, weights)
         past = np.zeros_like(estimate.covariance) if past_information is None else past_information
-        known = self._estimator.known_information(estimate.state.parameters)[0]
         others = np.zeros_like(past) if of_outline is None else of_outline
         if depths is not None:
             others = others + depths.terms(self._points, estimate.state)[1]
-        hessian = frame.hessian + others + past + known
+        hessian = frame.hessian + others + past + self._estimator.known_information(estimate.state.parameters)[0]
         if prior is not None:
             hessian = hessian + prior.terms(estimate.state)[1]
         gain, n_pairs = inverse_of_seen(hessian, self._estimator.scale), self._common.n_pairs(frame.usable)
         covariance, by_reference, self.beyond_reference = estimate.covariance.copy(), self._by_reference, None
         stated = estimate.covariance
         by_outline = with_outline = gain @ ((0.0 if whole is None else whole.T) + past @ self._by_outline)
-        if self._moved is not None:
-            moved = self._warped(estimate.state, self._moved)
+        if self._reference.moved is not None:
+            moved, left = self._reference.in_view(estimate.state), None if corrected is None else corrected.left
             push = self.pushed(frame, estimate.state, depths, moved)
-            push = push if corrected is None else push @ corrected.left
-            push = push + past @ self._by_reference
-            by_reference = gain @ push
-            if self._still and self._factors is not None:
-                # The pose's error moves the points on the surface, and the object with them: both count together.
-                d = len(estimate.state.parameters)
-                by_reference = gain @ (push - (frame.hessian + others)[:, d:] @ self._factors[d:])
-                by_reference[d:] = self._factors[d:]
+            push = (push if left is None else push @ left) + past @ self._by_reference
+            by_reference = self._moved_by(gain, push, frame.hessian + others)
             # A pose that is one over the sequence comes from all frames, with a covariance by what they leave.
-            if learns and not self._still and self._n_reference:
+            if learns and not self._still and self._reference.n_of_state:
                 # The correction is along what the points alone take for motion: what they leave is the same.
-                left = frame.left(moved, by_reference if corrected is None else corrected.transfer)
-                self.beyond_reference = self._beyond_reference(frame, left, gain, n_pairs)
-                self._learn_reference(frame, left[:, :, : self._n_reference], n_pairs)
+                rest = frame.left(moved, by_reference if corrected is None else corrected.transfer)
+                self.beyond_reference = self._beyond_reference(frame, rest, gain, n_pairs)
+                self._learn_reference(frame, rest[:, :, : self._reference.n_of_state], n_pairs)
             widened = by_reference * self._widening
             covariance += widened @ widened.T
-            if keeps:
-                self.with_scale = widened @ (self._shares if corrected is None else corrected.left @ self._shares)
             stated = stated + by_reference @ by_reference.T
-            shares = self._outline_shares if corrected is None else corrected.with_outline
+            if keeps:
+                shares = self._reference.shares
+                self.with_scale = widened @ (shares if left is None else left @ shares)
+            shares = self._reference.with_outline if corrected is None else corrected.with_outline
             with_outline = by_outline + widened @ shares
             for total, part in ((covariance, widened), (stated, by_reference)):
                 in_common = part @ shares @ by_outline.T
@@ -318,11 +203,25 @@ class SystematicErrors:
             self._by_outline, self.with_outline = by_outline, with_outline
         return replace(estimate, covariance=covariance, stated_covariance=stated)
 
+    def _moved_by(self, gain: Array, push: Array, hessian: Array) -> Array:
+        """How the reference's error factors move an estimate (d + 6, c).
+
+        ``hessian`` (d + 6, d + 6) is that of what the frame measured. The pose's error moves the points on the surface,
+        and where that pose is one over the sequence, the object with them: both count together.
+        """
+        of_state = self._reference.of_state
+        if not self._still or of_state is None:
+            return gain @ push
+        d = len(gain) - 6
+        by_reference = gain @ (push - hessian[:, d:] @ of_state[d:])
+        by_reference[d:] = of_state[d:]
+        return by_reference
+
     @property
     def _widening(self) -> Array:
         """By how much larger than stated each error factor (c,) is: those of the reference alone, not the depths'."""
-        widening = np.ones(len(self._shares))
-        widening[: self._n_reference] = self.reference_factor
+        widening = np.ones(len(self._reference.shares))
+        widening[: self._reference.n_of_state] = self.reference_factor
         return widening
 
     def _learn_reference(self, frame: Linearization, left: Array, n_pairs: float) -> None:
@@ -364,40 +263,20 @@ class SystematicErrors:
     ) -> Array:
         """J' W M J0 times the error factors of the reference (d + 6, c): how its error enters a frame's estimate.
 
-        With ``depths`` (p,) of the points, also how it enters by these; ``moved`` are `_moved` in the frame, if known.
+        With ``depths`` (p,) of the points, also how it enters by these; ``moved`` (p, 2, c) is how the factors move the
+        points in the frame, if known.
         """
-        if moved is None:
-            assert self._moved is not None
-            moved = self._warped(state, self._moved)
+        moved = self._reference.in_view(state) if moved is None else moved
         by_pixels = frame.products(moved)
         if depths is None:
             return by_pixels
-        of_depths = self._pushed_depths(state, depths, moved)
+        of_depths = self._reference.pushed_depths(state, depths, moved)
         return by_pixels + of_depths.slopes.T @ of_depths.pushes
-
-    def _pushed_depths(self, state: State, depths: PointDepths, moved: Array) -> PushedDepths:
-        """How the error factors enter depths: by those of other places on the surface, and by the depths' scale.
-
-        Parameters
-        ----------
-        state : of the frame, to linearise about.
-        depths : (p,) of the points.
-        moved : (p, 2, c) pixels, by which the points move there; zero of those that do not tell.
-        """
-        assert self._moved is not None
-        by_pixel = self._per_pixel(state)
-        tells = np.any(moved, axis=(1, 2), keepdims=True)[:, 0] & np.isfinite(by_pixel)
-        metres = np.einsum("pb,pbc->pc", np.where(tells, by_pixel, 0.0), self._moved)
-        metres += np.outer(depths.depths, self._shares)
-        residuals, slopes = depths.linearised(self._points, state)
-        roots = np.sqrt(huber_weights(np.abs(residuals), depths.huber_px))
-        pushes = (roots * depths.weights)[:, None] * metres
-        return PushedDepths(roots * residuals, roots[:, None] * slopes, pushes, metres)
 
     @property
     def knows_reference(self) -> bool:
         """Whether the reference's error is known, and none of the pose that holds in all frames."""
-        return self._n_reference > 0 and not self._still
+        return self._reference.n_of_state > 0 and not self._still
 
     @property
     def told_by_depths(self) -> bool:
@@ -405,7 +284,7 @@ class SystematicErrors:
 
         That is off by what these are off by, alike in further frames, of which only the scale is known.
         """
-        return self.knows_reference and self._scale.with_state is None
+        return self.knows_reference and self._told_by_depths
 
     def pushed_texture(
         self, state: State, residuals: Array, weights: Array, depths: PointDepths | None = None
@@ -419,12 +298,11 @@ class SystematicErrors:
         weights : (p,) of these.
         depths : (p,) of these; None where no depth camera saw them.
         """
-        assert self._moved is not None
         frame = Linearization.of(self._project(state)[1], residuals, weights, self._estimator.options.huber_px)
-        moved = self._warped(state, self._moved)
+        moved = self._reference.in_view(state)
         transfer = inverse_of_seen(frame.hessian, self._estimator.scale) @ frame.products(moved)
-        of_depths = None if depths is None else self._pushed_depths(state, depths, moved)
-        return PushedTexture(frame, transfer, of_depths, self._outline_shares)
+        of_depths = None if depths is None else self._reference.pushed_depths(state, depths, moved)
+        return PushedTexture(frame, transfer, of_depths, self._reference.with_outline)
 
     def pushed_by_model(self, frame: Linearization, chain: Array, gain: Array, common_px: float) -> Array:
         """How an estimate from several cameras moves (n, c) by what the model is off in this one.
@@ -492,10 +370,8 @@ class SystematicErrors:
         all_columns[~np.isfinite(all_columns).all(axis=(1, 2))] = 0.0
         by_state = np.delete(all_columns, np.s_[d : d + m], axis=2)
         of_reference = by_state @ by_reference
-        if self._moved is not None:
-            pixels = self._estimator.camera.project(state.camera_from_object.apply(self._corners.rest))
-            at_rest = _warped_motions(pixels, self._inverse_edges, self._moved)
-            slid = self.reference_factor * (at_rest - self._warped(state, self._moved))
+        if self._reference.moved is not None:
+            slid = self.reference_factor * self._reference.by_deformation(state)
             if corrected is None:
                 of_reference += slid
             else:
@@ -512,39 +388,10 @@ class SystematicErrors:
         residuals, huber = estimate.residuals[: len(weights)], self._estimator.options.huber_px
         return Linearization.of(jacobian, residuals, weights, huber)
 
+    def warped(self, state: State, moved: Array) -> Array:
+        """How pixels move (p, 2) in the view of a state where they move by ``moved`` (p, 2) in the reference view."""
+        return self._reference.warped(state, moved)
+
     def _project(self, state: State, rows: Array | None = None) -> tuple[Array, Array]:
         """Pixels (p, 2) and their derivatives, by other values and derivatives (1 + d, m) of the functions if given."""
         return project_with_jacobian(*self._points.in_state(state, rows), self._estimator.camera.intrinsics)
-
-    def warped(self, state: State, moved: Array) -> Array:
-        """How pixels move (p, 2) in the view of a state where they move by ``moved`` (p, 2) in the reference view."""
-        return self._warped(state, np.ascontiguousarray(moved[:, :, None]))[:, :, 0]
-
-    def _warped(self, state: State, moved: Array) -> Array:
-        """How pixels move (p, 2, c) in a view where they move by ``moved`` (p, 2, c) in the reference view."""
-        pixels = self._estimator.camera.project(self._corners.in_camera(state))
-        return _warped_motions(pixels, self._inverse_edges, moved)
-
-
-@njit(cache=True, nogil=True)
-def _warped_motions(pixels, inverse_edges, moved):
-    """Motions (p, 2, c) of pixels, by the warp E E0^-1 of the edges of each one's triangle; zero where that is large.
-
-    Parameters
-    ----------
-    pixels : (3 p, 2) of the triangles' corners.
-    inverse_edges : (p, 2, 2) E0^-1, of two edges as columns in the reference view.
-    moved : (p, 2, c) motions there.
-    """
-    found, warp = np.zeros_like(moved), np.empty((2, 2))
-    for j in range(len(moved)):
-        for row in range(2):
-            first = pixels[3 * j + 1, row] - pixels[3 * j, row]
-            second = pixels[3 * j + 2, row] - pixels[3 * j, row]
-            for column in range(2):
-                warp[row, column] = first * inverse_edges[j, 0, column] + second * inverse_edges[j, 1, column]
-        if np.isfinite(np.sum(warp)) and np.abs(warp).max() < LARGEST_STRETCH:
-            for row in range(2):
-                for k in range(moved.shape[2]):
-                    found[j, row, k] = warp[row, 0] * moved[j, 0, k] + warp[row, 1] * moved[j, 1, k]
-    return found

@@ -47,11 +47,11 @@ from morph_dslam.tracking.outcomes import FoundBy, PoseSource, Rejection, Reject
 from morph_dslam.tracking.patches import LEVELS, follow, zero_where_unknown
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, first_view
 from morph_dslam.tracking.reference_correction import ReferenceCorrection
+from morph_dslam.tracking.reference_factors import error_factors_of
 from morph_dslam.tracking.refinement import Keyframe
 from morph_dslam.tracking.result import STAGES, FrameResult
 from morph_dslam.tracking.row_motion import StateHistory
 from morph_dslam.tracking.still import held
-from morph_dslam.tracking.systematic_errors import error_factors_of
 from morph_dslam.tracking.tracker_inputs import (
     Picture,
     check_camera,

@@ -28,9 +28,10 @@ from morph_dslam.tracking.options import TrackerOptions
 from morph_dslam.tracking.patches import normalize_contrast
 from morph_dslam.tracking.recovery import Recovery
 from morph_dslam.tracking.reference import PosedImage, ReferenceView, SurfaceSamples, choose_view, covered_share
+from morph_dslam.tracking.reference_factors import error_factors_of
 from morph_dslam.tracking.reference_misfit import UNEXPLAINED_PX
 from morph_dslam.tracking.sequence_filter import PointChange
-from morph_dslam.tracking.systematic_errors import SystematicErrors, error_factors_of
+from morph_dslam.tracking.systematic_errors import SystematicErrors
 
 Array = NDArray[np.float64]
 #: Share of the visible points that must agree, and the largest robust spread of their residuals, pixels.
