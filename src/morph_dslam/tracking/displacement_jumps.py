@@ -258,7 +258,8 @@ def _nearest(points: Array) -> NDArray[np.int64]:
     count = min(NEAREST, max(len(points) - 1, 0))
     if not count:
         return np.zeros((len(points), 0), dtype=np.int64)
-    return np.asarray(KDTree(points).query(points, count + 1)[1][:, 1:], dtype=np.int64)
+    found = np.asarray(KDTree(points).query(points, count + 1)[1], dtype=np.int64)
+    return found[:, 1:]
 
 
 def _surroundings(rest: Array, reach: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:
