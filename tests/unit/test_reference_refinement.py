@@ -13,7 +13,7 @@ from morph_dslam.tracking.binding import nearest_surface_points
 from morph_dslam.tracking.depth_registration import refine_by_depth
 from morph_dslam.tracking.estimator import BoundPoints, Estimator, State
 from morph_dslam.tracking.known_state import LandmarkTerm
-from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, minimum, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, minimum, refine_reference, relied_on
 from tests.support.bent_sheet import bent_sheet_model
 from tests.support.measured_points import bound_points
 from tests.support.rendered_sequence import CAMERA, mean_error, sheet_depth, sheet_state
@@ -85,6 +85,15 @@ def test_keyframes_are_spread_over_the_sequence():
     assert choose_keyframes([], 5) == []
     assert choose_keyframes(list(range(3)), 5) == [0, 1, 2]
     assert choose_keyframes(list(range(101)), 5) == [0, 25, 50, 75, 100]
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "end", "expected"),
+    [((), np.inf, "abcd"), ((3,), np.inf, "acd"), ((3, 9), 8, "ac"), ((0, 3, 7), 8, "abc"), ((), 0, "")],
+    ids=["all", "without mistaken ones", "before it opens", "mistaken ones alone", "none"],
+)
+def test_frames_that_explain_no_pose_do_not_count_for_it_if_others_do(mistaken, end, expected):
+    assert "".join(relied_on([(0, "a"), (3, "b"), (7, "c"), (9, "d")], frozenset(mistaken), end)) == expected
 
 
 MODEL = bent_sheet_model(22, 16)

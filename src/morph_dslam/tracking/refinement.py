@@ -8,7 +8,7 @@ those of keyframes, each at its own best state (variable projection), are minimi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -82,6 +82,16 @@ LANDMARK_PX, LEAST_LANDMARK_PX = 0.5, 0.1
 def landmark_deviation(fitted_px: float) -> float:
     """Standard deviation of a landmark, pixels: how well they fit shows it, where they are enough."""
     return max(fitted_px, LEAST_LANDMARK_PX) if np.isfinite(fitted_px) else LANDMARK_PX
+
+
+def relied_on(seen: Sequence[tuple[int, Keyframe]], mistaken: Collection[int], end: float) -> list[Keyframe]:
+    """Keyframes, of the frames ``seen`` by number, that count for what is the same in the whole sequence.
+
+    Those from frame ``end`` on do not, in which the surface is open, nor the ``mistaken`` ones, whose results are not
+    to be relied on: no pose explains them. Without others the latter have to do.
+    """
+    known = [(frame, keyframe) for frame, keyframe in seen if frame < end]
+    return [keyframe for frame, keyframe in known if frame not in mistaken] or [keyframe for _, keyframe in known]
 
 
 def choose_keyframes(keyframes: Sequence[Keyframe], count: int = N_KEYFRAMES) -> list[Keyframe]:

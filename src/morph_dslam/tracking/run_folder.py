@@ -330,8 +330,8 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     """Of each support the force that is largest for certain, its standard deviation and frame; the largest one first.
 
     Where none differs from zero it is the largest one with a finite deviation, as so much may have acted; supports of
-    which that holds come last. Frames that are not to be relied on, or in which the surface is
-    torn, count only if there are no others.
+    which that holds come last. Frames that are not to be relied on, or in which the surface is torn, count only if
+    there are no others.
 
     The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
     the reduction, and where it was estimated of the discretisation too.

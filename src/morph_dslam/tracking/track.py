@@ -47,7 +47,7 @@ from morph_dslam.tracking.placement import (
     place_by_map,
     with_other_images,
 )
-from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, landmark_deviation, refine_reference
+from morph_dslam.tracking.refinement import Keyframe, choose_keyframes, landmark_deviation, refine_reference, relied_on
 from morph_dslam.tracking.reregistration import Reregistration
 from morph_dslam.tracking.run_facts import run_facts
 from morph_dslam.tracking.run_folder import RunFolder
@@ -317,10 +317,7 @@ class _Job:
         placed = []
         for part, folder in zip(begun, self._folders, strict=True):
             end = opened[part.name].first if part.name in opened else np.inf
-            known, mistaken = dict(self._seen[part.name]), folder.results.mistaken_frames
-            known = {frame: keyframe for frame, keyframe in known.items() if frame < end}
-            # No pose explains frames that are not to be relied on; without others these have to do.
-            seen = [keyframe for frame, keyframe in known.items() if frame not in mistaken] or list(known.values())
+            seen = relied_on(self._seen[part.name], folder.results.mistaken_frames, end)
             placed.append(_refined(part, seen, run))
         with self._interrupts:  # until then the frames of the pass before are the results
             self._placed, self._views = placed, _views_of(placed, run)
