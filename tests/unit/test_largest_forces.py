@@ -9,43 +9,39 @@ from morph_dslam.tracking.reactions import Reaction, VectorEstimate
 from morph_dslam.tracking.run_folder import largest_forces
 from tests.support.stretched_block import stretched_block_model
 
+NOTHING = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
+
+
+def run_of(frames, support, forces, mistaken=(), torn=()):
+    """A run with these forces on its one support."""
+    reactions = {support: [Reaction(np.zeros(3), force, NOTHING) for force in forces]}
+    return SimpleNamespace(
+        model=stretched_block_model(),
+        frames=frames,
+        reactions=lambda: reactions,
+        mistaken_frames=frozenset(mistaken),
+        torn_frames=frozenset(torn),
+    )
+
 
 def test_the_largest_force_is_that_which_is_largest_for_certain():
     """3 N along z to 0.1 N; 5 N, of which 4 N along y are known to 3 N; and 3.1 N of which nothing is known."""
-    none = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
     forces = [
         VectorEstimate.of(np.array([0.0, 0.0, 3.0]), 0.01 * np.eye(3)),
         VectorEstimate.of(np.array([0.0, 4.0, 3.0]), np.diag([0.01, 9.0, 0.01])),
         VectorEstimate.of(np.array([0.0, 3.1, 0.0]), np.full((3, 3), np.inf)),
     ]
-    reactions = {"tip": [Reaction(np.zeros(3), force, none) for force in forces]}
-    run = SimpleNamespace(
-        model=stretched_block_model(),
-        frames=[4, 5, 6],
-        reactions=lambda: reactions,
-        mistaken_frames=frozenset(),
-        torn_frames=frozenset(),
-    )
-    (largest,) = largest_forces(run)
+    (largest,) = largest_forces(run_of([4, 5, 6], "tip", forces))
     assert (largest["frame"], largest["force_N"]) == (4, 3.0)
-    del reactions["tip"][0], run.frames[0]
-    assert largest_forces(run)[0]["frame"] == 5
+    assert largest_forces(run_of([5, 6], "tip", forces[1:]))[0]["frame"] == 5
 
 
 def test_no_force_at_all_is_as_uncertain_as_its_least_known_direction():
     """A poke of 56 mN known to 49 mN, and frames in which nothing is found, to 252 mN in one direction."""
     nothing = VectorEstimate.of(np.zeros(3), np.diag([0.01, 0.252, 0.05]) ** 2)
     assert nothing.size_std == pytest.approx(0.252)
-    poke, none = VectorEstimate.of(np.array([0.0, 0.0, -0.056]), np.diag([0.01, 0.01, 0.049]) ** 2), np.zeros(3)
-    reactions = {"unknown loads": [Reaction(none, force, nothing) for force in (nothing, nothing, poke)]}
-    run = SimpleNamespace(
-        model=stretched_block_model(),
-        frames=[0, 1, 12],
-        reactions=lambda: reactions,
-        mistaken_frames=frozenset(),
-        torn_frames=frozenset(),
-    )
-    (largest,) = largest_forces(run)
+    poke = VectorEstimate.of(np.array([0.0, 0.0, -0.056]), np.diag([0.01, 0.01, 0.049]) ** 2)
+    (largest,) = largest_forces(run_of([0, 1, 12], "unknown loads", [nothing, nothing, poke]))
     assert (largest["frame"], largest["force_N"]) == (12, pytest.approx(0.056))
     assert largest["standard_deviation_N"] == pytest.approx(0.049)
 
@@ -55,17 +51,7 @@ def test_where_no_force_is_told_from_zero_the_largest_that_may_have_acted_is_giv
     """0.8 N to 7.6 N, 120 N to 330 N and 200 N of which nothing is known; 10 N to 2 N is certain."""
     known = [(0.8, 7.6), (120.0, 330.0), (200.0, np.inf)] + [(10.0, 2.0)] * certain
     forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), std**2 * np.ones((3, 3))) for size, std in known]
-    none = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
-    reactions = {"x_min": [Reaction(np.zeros(3), force, none) for force in forces]}
-    run = SimpleNamespace(
-        model=stretched_block_model(),
-        frames=[3, 4, 5, 6],
-        reactions=lambda: reactions,
-        mistaken_frames=frozenset(),
-        torn_frames=frozenset(),
-    )
-    run.frames = run.frames[: len(known)]
-    (largest,) = largest_forces(run)
+    (largest,) = largest_forces(run_of([3, 4, 5, 6][: len(known)], "x_min", forces))
     figures = largest["differs_from_zero"], largest["frame"], largest["force_N"], largest["standard_deviation_N"]
     assert figures == (certain, *((6, 10.0, 2.0) if certain else (4, 120.0, pytest.approx(330.0))))
 
@@ -75,12 +61,6 @@ def test_where_no_force_is_told_from_zero_the_largest_that_may_have_acted_is_giv
 )
 def test_a_frame_that_is_not_to_be_relied_on_has_not_the_largest_force(mistaken, torn, frame):
     """1 N, 2 N and 3 N; if all frames are doubtful, they have to do."""
-    none = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
     forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), 1e-4 * np.eye(3)) for size in (1.0, 2.0, 3.0)]
-    reactions = {"tip": [Reaction(np.zeros(3), force, none) for force in forces]}
-    run = SimpleNamespace(
-        model=stretched_block_model(), frames=[4, 5, 6], reactions=lambda: reactions,
-        mistaken_frames=frozenset(mistaken), torn_frames=frozenset(torn),
-    )  # fmt: skip
-    (largest,) = largest_forces(run)
+    (largest,) = largest_forces(run_of([4, 5, 6], "tip", forces, mistaken, torn))
     assert (largest["frame"], largest["force_N"]) == (frame, frame - 3.0)

@@ -80,9 +80,9 @@ def why_unread(path: Path, error: Exception) -> str:
         if not sum(stated):
             return "holds no cells: save the mesh with its cells"
         with suppress(Exception):  # meshio raises whatever its parsers meet
-            types = _types(path)
-            numbers += [number for number in np.unique(types).tolist() if _ends_reading(number, path)]
-            if not numbers and _other_sizes(path, types):
+            types, is_old = _types(path), _is_old(path)
+            numbers += [number for number in np.unique(types).tolist() if _ends_reading(number, is_old)]
+            if not numbers and is_old and _other_sizes(path, types):
                 reason = "its cells have other numbers of nodes than cells of their types"
     if numbers:
         return f"holds {_named(numbers)}"
@@ -100,20 +100,23 @@ def _is_old(path: Path) -> bool:
     return file_kind(path) == ".vtk" and b"\nOFFSETS " not in path.read_bytes()
 
 
-def _ends_reading(number: int, path: Path) -> bool:
-    """Whether meshio refuses a file for cells of a type, by VTK's number, rather than read them or leave them out."""
+def _ends_reading(number: int, is_old: bool) -> bool:
+    """Whether meshio refuses a file for cells of a type, by VTK's number, rather than read them or leave them out.
+
+    ``is_old`` is as of `_is_old`.
+    """
     name = vtk_to_meshio_type.get(number)
     if name is None:
-        return _is_old(path)
-    # Of polygons and Lagrange cells the newer formats tell each one's number of nodes.
-    is_told = name == "polygon" or (name.startswith("VTK_LAGRANGE") and not _is_old(path))
-    return name not in num_nodes_per_cell and not is_told
+        return is_old
+    # Of polygons and Lagrange cells the newer formats state each one's number of nodes.
+    is_stated = name == "polygon" or (name.startswith("VTK_LAGRANGE") and not is_old)
+    return name not in num_nodes_per_cell and not is_stated
 
 
 def _other_sizes(path: Path, types: NDArray[np.int64]) -> bool:
     """Whether an old legacy file states another number of nodes than cells of its ``types`` (n,) have."""
     found = re.search(rb"^CELLS[ \t]+\d+[ \t]+(\d+)", path.read_bytes(), re.MULTILINE)
-    if found is None or not _is_old(path):
+    if found is None:
         return False
     return int(found[1]) != sum(1 + num_nodes_per_cell[vtk_to_meshio_type[number]] for number in types.tolist())
 

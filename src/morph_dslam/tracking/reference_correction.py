@@ -122,8 +122,7 @@ class ReferenceCorrection:
     @property
     def made_good(self) -> Array:
         """A symmetric root (c, c) of the covariance that the corrections have, I less the one that is left."""
-        values, vectors = np.linalg.eigh(self.left @ self.left)
-        return np.asarray((vectors * np.sqrt(np.clip(1.0 - values, 0.0, 1.0))) @ vectors.T, dtype=np.float64)
+        return symmetric_root(np.eye(len(self.left)) - self.left @ self.left)
 
     def left_by_cause(self) -> tuple[Array, Array]:
         """What is left of the error factors by what they are, and by the noise of what corrects; P and (P - P^2)^1/2.
