@@ -8,7 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from scipy.optimize import nnls
+from scipy.optimize import minimize_scalar, nnls
 from scipy.stats import multivariate_normal
 
 from morph_dslam import Camera, build, make_study
@@ -350,6 +350,28 @@ def test_the_evidence_is_that_of_a_gaussian():
     for case in cases[1:]:
         expected = density(*case) - density(*first)
         assert log_evidence(frames, *case) - log_evidence(frames, *first) == pytest.approx(expected, rel=1e-9)
+
+
+def test_spots_that_a_frame_hardly_distinguishes_share_the_variance_by_their_evidence():
+    """Each alone by the maximum of scipy's density, two of them nearly alike."""
+    rng, work = np.random.default_rng(5), 0.01
+    information, spots = 10.0 ** rng.uniform(0, 3, 9), rng.standard_normal((9, 5))
+    spots[:, 3] = spots[:, 1] + 0.1 * rng.standard_normal(9)
+    seen = SeenLoads(information, spots, 6.0 * spots[:, 1] + rng.normal(0.0, np.sqrt(1.0 + work * information)))
+    values, evidence = [], []
+    for spot in spots.T:
+
+        def density(log_variance, spot=spot):
+            covariance = np.diag(1.0 + work * information) + np.exp(log_variance) * np.outer(spot, spot)
+            return -multivariate_normal(cov=covariance).logpdf(seen.values)
+
+        best = minimize_scalar(density, bounds=(-20.0, 10.0), method="bounded", options={"xatol": 1e-9})
+        values.append(np.exp(best.x))
+        evidence.append(-best.fun)
+    shares = np.exp(np.array(evidence) - max(evidence))
+    expected = np.array(values) * shares / shares.sum()
+    assert 0.02 < expected[3] / expected[1] < 50.0
+    np.testing.assert_allclose(spot_variances([seen], work), expected, rtol=1e-3, atol=1e-3 * expected.max())
 
 
 def _frames(loaded, displacements, force, rng):

@@ -4,7 +4,9 @@ What presses on a body mostly does so at a few places. So loads are a sum of two
 of several sizes at places spread over the surface, each with a variance of its own; and all others, as likely as
 exp(-energy / work). Variances and work maximise the evidence of the last frames. Most variances are zero then: spots
 are added, changed and removed one by one (Tipping and Faul, AISTATS 2003), here for several frames with one set of
-variances.
+variances. Frames rarely show which of several spots acts: a near one, or a larger force on one that is hidden. So the
+variance of each that was found is shared out among all that could stand in its place, by their evidence (averaging over
+models: Hoeting et al., Statistical Science 14, 1999).
 """
 
 from __future__ import annotations
@@ -36,6 +38,8 @@ LEAST_SEEN, ROUNDING = 0.01, 1e-13
 LEAST_SHARPNESS = 1e-7
 #: Steps to the variance that several frames have in common.
 STEPS = 3
+#: A spot that could stand in another's place with less than this share of the evidence of all that could is left out.
+LEAST_PLAUSIBLE = 1e-3
 
 
 def spot_displacements(model: ReducedModel, loads: UnknownLoads) -> Array:
@@ -180,9 +184,9 @@ class _Evidence:
 
 
 def spot_variances(frames: list[SeenLoads], work: float) -> Array:
-    """Variances (s,) of the spots, N2, that explain some frames best beside loads of this work scale, J."""
+    """Variances (s,) of the spots, N2, beside loads of this work scale, J, as the evidence of some frames has them."""
     variances = np.zeros(frames[0].spots.shape[1])
-    evidences = [_Evidence(seen, work) for seen in frames]
+    evidences = _evidences(frames, work, variances)
     for _ in range(MOST_CHANGES):
         best, gain = _best_variances(evidences, variances)
         k = int(gain.argmax())
@@ -191,7 +195,30 @@ def spot_variances(frames: list[SeenLoads], work: float) -> Array:
         for evidence in evidences:
             evidence.change(k, float(best[k] - variances[k]))
         variances[k] = best[k]
-    return variances
+    return sum((_stand_ins(frames, work, variances, k) for k in np.flatnonzero(variances)), np.zeros_like(variances))
+
+
+def _stand_ins(frames: list[SeenLoads], work: float, variances: Array, k: int) -> Array:
+    """Variances (s,) of the spots that could stand in the place of spot ``k`` beside the others, times their shares.
+
+    The shares are those of the models with one of them each, equally likely before the frames were seen.
+    """
+    others = variances.copy()
+    others[k] = 0.0
+    best, gain = _best_variances(_evidences(frames, work, others), others)
+    could = (others == 0.0) & (best > 0.0)
+    shares = np.where(could, np.exp(gain - gain[could].max(initial=0.0)), 0.0)
+    shares[shares < LEAST_PLAUSIBLE * shares.sum()] = 0.0
+    return best * shares / max(float(shares.sum()), 1e-300)
+
+
+def _evidences(frames: list[SeenLoads], work: float, variances: Array) -> list[_Evidence]:
+    """The spots' part in the evidence of each frame, where they have these variances (s,)."""
+    evidences = [_Evidence(seen, work) for seen in frames]
+    for k in np.flatnonzero(variances).tolist():
+        for evidence in evidences:
+            evidence.change(k, float(variances[k]))
+    return evidences
 
 
 def _best_variances(evidences: list[_Evidence], variances: Array) -> tuple[Array, Array]:
