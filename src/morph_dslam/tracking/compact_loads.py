@@ -195,7 +195,8 @@ def spot_variances(frames: list[SeenLoads], work: float) -> Array:
         for evidence in evidences:
             evidence.change(k, float(best[k] - variances[k]))
         variances[k] = best[k]
-    return sum((_stand_ins(frames, work, variances, k) for k in np.flatnonzero(variances)), np.zeros_like(variances))
+    found = np.flatnonzero(variances).tolist()
+    return sum((_stand_ins(frames, work, variances, k) for k in found), np.zeros_like(variances))
 
 
 def _stand_ins(frames: list[SeenLoads], work: float, variances: Array, k: int) -> Array:
