@@ -224,14 +224,17 @@ FINE = Camera(3 * CAMERA.width, 3 * CAMERA.height, 3 * CAMERA.fx, 3 * CAMERA.fy,
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_pose_in_which_landmarks_fit_much_worse_than_alone_is_named_with_what_lengths_are_off_by(seed):
-    """Of a part that differs from its drawing by 4 px, 3 % too near: twelve misses of two to three deviations each."""
+    """Of a part that differs from its drawing by 4 px, 3 % too near: twelve misses of two to three deviations each.
+
+    The deviation by which they count says nothing of that: it is by a median, and may be far smaller.
+    """
     rng, pose = np.random.default_rng(seed), RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.8]))
     points = np.ascontiguousarray(MODEL.nodes[rng.choice(len(MODEL.nodes), 12, replace=False)])
     pixels = FINE.project(pose.apply(points)) + 4.0 * rng.standard_normal((12, 2))
     _, rotation, translation = cv2.solvePnP(points, pixels, FINE.matrix, None)
     alone = cv2.projectPoints(points, rotation, translation, FINE.matrix, None)[0][:, 0] - pixels
-    term = LandmarkTerm(bind_landmarks(MODEL, points), pixels, float(np.sqrt(np.sum(alone**2) / 18.0)))
-    landmarks = LandmarksAlone(term, float(np.sqrt(np.sum(alone**2) / 12.0)), n_unknowns=6, poor_px=3.0)
+    term = LandmarkTerm(bind_landmarks(MODEL, points), pixels, 1.5)
+    landmarks = LandmarksAlone(term, float(np.sqrt(np.sum(alone**2) / 12.0)), n_unknowns=6, click_px=1.5)
 
     def said(distance):
         at = State(MODEL.default, RigidTransform(pose.rotation, np.array([0.0, 0.0, distance])))

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import fdtrc
 
+from morph_dslam.better_fit import chance_of_better_fit
 from morph_dslam.camera import Camera
+from morph_dslam.registration.landmark_fit import poor_px
 from morph_dslam.registration.messages import RegistrationWarning
 from morph_dslam.tracking.known_state import LandmarkTerm
 from morph_dslam.tracking.still import TERM_STD, StillFit, corner_radius
@@ -106,30 +107,32 @@ class LandmarksAlone:
 
     Attributes
     ----------
-    term : what they say of a state; its deviation is that by which they count in the pose over the sequence.
+    term : what they say of a state.
     rms_px : by how much they are off then, root mean square.
     n_unknowns : how many they were fitted by.
-    poor_px : deviation of a coordinate from which on landmarks are said to fit badly; less is of no account.
+    click_px : standard deviation of a carefully set landmark.
     """
 
     term: LandmarkTerm
     rms_px: float
     n_unknowns: int
-    poor_px: float
+    click_px: float
 
     def away(self, found: StillFit) -> PoseAwayFromLandmarks | None:
         """That the pose over the sequence is away from them; None where errors of clicks may do that.
 
-        The statistic is F: what the squares rise by, for each of the unknowns, in the landmarks' variance, which their
-        own residuals have shown. In the right pose these rise by no more than their errors have taken up before.
+        The statistic is F: what the squares rise by, for each of the unknowns, in the variance that the landmarks show
+        alone by their squares, or that of carefully set ones if that is larger. In the right pose they rise by no more
+        than the landmarks' errors have taken up before. Where they fit well as landmarks go, it is of no account.
         """
         term, k = self.term, len(self.term.recorded)
         off = term.sigma_px * term.away(found.camera, found.state)
         lengths, freedom = np.linalg.norm(off, axis=1), 2 * k - self.n_unknowns
         off_px = float(np.sqrt(np.mean(lengths**2)))
-        rise = max(k * (off_px**2 - self.rms_px**2), 0.0) / self.n_unknowns / term.sigma_px**2
-        is_chance = freedom < 1 or fdtrc(self.n_unknowns, freedom, rise) > AWAY_CHANCE
-        if is_chance or off_px < np.sqrt(2.0) * self.poor_px:
+        if freedom < 1 or off_px < np.sqrt(2.0) * poor_px(found.camera, self.click_px):
+            return None
+        squares = k * off_px**2, k * self.rms_px**2
+        if chance_of_better_fit(*squares, self.n_unknowns, freedom, self.click_px) > AWAY_CHANCE:
             return None
         drawn = found.camera.undistort_pixels(term.recorded) + off
         drawn, seen = (pixels - pixels.mean(axis=0) for pixels in (drawn, drawn - off))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from morph_dslam.io.landmarks import Landmarks
 from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.landmark_binding import bind_landmarks
-from morph_dslam.registration.landmark_fit import poor_px
 from morph_dslam.registration.messages import Ambiguity, Ambiguous
 from morph_dslam.sources import Frame
 from morph_dslam.tracking.depth_registration import depth_term
@@ -117,8 +116,7 @@ def _landmarks_alone(part: PlacedObject) -> LandmarksAlone | None:
     if term is None:
         return None
     n_unknowns = 6 if part.object.at_rest else Box.of(part.model).n_unknowns
-    least_px = poor_px(part.camera, part.object.click_px)
-    return LandmarksAlone(term, part.registration.facts["residual_rms_px"], n_unknowns, least_px)
+    return LandmarksAlone(term, part.registration.facts["residual_rms_px"], n_unknowns, part.object.click_px)
 
 
 def _state_term(part: PlacedObject, covariance: Array) -> StateTerm:
