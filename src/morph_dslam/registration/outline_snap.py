@@ -286,10 +286,10 @@ class OutlineSnap:
         estimate : made from it.
         variance : of a point of the outline, px^2.
         """
-        state, estimator = estimate.state, self._estimator
-        inverse = self._inverse(estimator.evaluate(*measured.at(state))[1])
-        seen = estimate.residuals, measured.weights, measured.normals, estimator.options.huber_px
-        by_one_px = weighted_derivatives(*measured.points.in_state(state), estimator.camera.intrinsics, *seen)[2]
+        points, camera, huber_px = measured.points, self._estimator.camera, self._estimator.options.huber_px
+        seen = estimate.residuals, measured.weights, measured.normals, huber_px
+        _, hessian, by_one_px = weighted_derivatives(*points.in_state(estimate.state), camera.intrinsics, *seen)
+        inverse = self._inverse(hessian)
         moved_by_whole = whole_deviation(variance) * by_one_px @ inverse
         return sigma**2 * inverse + moved_by_whole.T @ moved_by_whole
 
