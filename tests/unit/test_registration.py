@@ -250,8 +250,12 @@ def test_damaged_registrations_are_refused(tmp_path):
         {"frame": 4},
         {"frame": "last"},
         {"frame": np.inf},
+        {"frame": 7.6},
         {"map_renumbered": [np.inf]},
+        {"map_renumbered": [True, 3]},
         {"keyframes": []},
+        {"keyframes": [keyframe | {"frame": 3.7}]},
+        {"keyframes": [keyframe | {"frame": True}]},
         {"keyframes": [keyframe | {"camera_from_object": [[1.0]]}]},
         {"keyframes": [keyframe | {"covariance": [[1.0]]}]},
     ):

@@ -113,8 +113,8 @@ def _from_content(content: dict[str, Any], model: ReducedModel) -> Registration:
     axis = content["axis_of_revolution"]
     axis = axis and Axis(_numbers(axis["point_m"], (3,)), _numbers(axis["direction"], (3,)))
     # Earlier files have none of these.
-    frame = None if content.get("frame") is None else int(content["frame"])
-    renumbered = tuple(int(more) for more in content.get("map_renumbered", []))
+    frame = None if content.get("frame") is None else _whole(content["frame"])
+    renumbered = tuple(_whole(more) for more in content.get("map_renumbered", []))
     rivals = [Rival(_placed(each), float(each["score"])) for each in content.get("rivals", [])]
     keyframes = _keyframes(content["keyframes"])
     registration = registration_in_map(model, found, keyframes, facts, warnings, axis, frame=frame)
@@ -148,7 +148,7 @@ def _keyframes(entries: list[dict[str, Any]]) -> list[KeyframePose]:
         factors = entry["error_factors"]
         keyframes.append(
             KeyframePose(
-                int(entry["frame"]),
+                _whole(entry["frame"]),
                 RigidTransform.from_matrix(_numbers(entry["camera_from_object"], (4, 4))),
                 _optional(entry["covariance"], (6, 6)),
                 factors and _numbers(factors, (6, np.size(factors) // 6)),
@@ -176,6 +176,13 @@ def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
     if array.shape != shape or not (np.abs(array) < LARGEST).all():
         raise ValueError(f"an array of shape {shape} was expected")
     return array
+
+
+def _whole(value: Any) -> int:
+    """A whole number of a registration's file; raises ValueError if it is none, so that no other frame is meant."""
+    if type(value) is not int:  # true is an instance
+        raise ValueError(f"{value!r} is no whole number")
+    return value
 
 
 def _optional(values: Any, shape: tuple[int, ...]) -> Array | None:
