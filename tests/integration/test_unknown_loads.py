@@ -109,6 +109,29 @@ def test_a_load_has_the_arm_of_the_place_to_which_the_body_has_moved(file):
         np.testing.assert_allclose(now.moment.std, [0.0, 0.002 * abs(rest.moment.value[1]), 0.0], atol=5e-6 * size)
 
 
+def test_a_load_that_moves_the_body_itself_has_no_arm_by_that(file):
+    """Statics of a body that its loads shift by up to 40 mm: about their own point they have the moment as without."""
+    model, rng = load_model(file), np.random.default_rng(4)
+    loads, shifts = model.unknown_loads, rng.uniform(-2e-2, 2e-2, (25, 3))
+    assert loads is not None
+    constant = ParameterFunctions(model.lower, model.upper, np.array([[0]]), np.ones((1, 1)))
+    for load in rng.random((5, 25)):
+        found = []
+        for share in (0.0, 1.0):
+            modes = np.tile(share * shifts.ravel(), (1, len(model.nodes), 1))
+            responses = loads.responses | {"displacement": SeparatedField(modes, constant)}
+            own = replace(loads, responses=responses, second_order=None)
+            state = State(np.array([500.0, *load]), RigidTransform.identity())
+            covariance = np.diag([20.0, *np.full(25, 0.01), *np.zeros(6)]) ** 2
+            estimate = Estimate(state, 0.0, np.zeros((0, 2)), 0.3, covariance, np.zeros(26, dtype=bool), 1, True)
+            found.append(Reactions(with_unknown_loads(replace(model, unknown_loads=own), 1e-3))(estimate)[LOADS])
+        rest, now = found
+        size = 0.06 * np.linalg.norm(rest.force.value)
+        np.testing.assert_allclose(now.point, rest.point + load @ shifts, atol=1e-9)
+        np.testing.assert_allclose(now.moment.value, rest.moment.value, atol=1e-9 * size)
+        np.testing.assert_allclose(now.moment.std, rest.moment.std, atol=1e-9 * size)
+
+
 class _Pressed:
     """The block with a pressure on its whole top, by finite elements with the pressure in them, before a camera."""
 

@@ -8,7 +8,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,6 +24,7 @@ from morph_dslam.tracking.observability import beyond_first_order
 Array = NDArray[np.float64]
 #: Values (3,) of a field at parameters, and their derivatives (d, 3).
 _Field = Callable[[Array], tuple[Array, Array]]
+_Place = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Reaction:
     point : (3,) mean of the deformed nodes that the support holds, object frame, m; the origin for a model file that
         does not name them; of unknown loads the mean of the deformed nodes by the square of their traction.
     force : N.
-    moment : about the point, N m.
+    moment : about the point, N m; of unknown loads by the arms that they have in the parametric state.
     """
 
     point: Array
@@ -98,25 +99,22 @@ class Reactions:
         known = np.isfinite(covariance).all()
 
         found = {}
-        for name, fields in self._parts.items():
-            (point, arms), (force, forces), (about_origin, moments) = (field(mu) for field in fields)
-            moment_slopes = moments - np.cross(arms, force) - np.cross(point, forces)
-            values = np.stack([force, about_origin - np.cross(point, force)])
-            slopes = np.stack([forces, moment_slopes], axis=1)
+        for name, (place, *fields) in self._parts.items():
+            (force, forces), (moment, moments) = (field(mu) for field in fields)
+            values, slopes = np.stack([force, moment]), np.stack([forces, moments], axis=1)
             spread = np.full((2, 3, 3), np.inf)
             if known:
-                of_name = partial(_force_and_moment, fields)
-                missed = beyond_first_order(of_name, slopes, mu, covariance, self._model)
+                missed = beyond_first_order(partial(_values, fields), slopes, mu, covariance, self._model)
                 spread = np.einsum("dpx,de,epy->pxy", slopes, covariance, slopes)
                 spread += np.einsum("mpx,mpy->pxy", missed, missed)
             # A common factor of the moduli is one more parameter, by which the derivative is the value itself.
             spread = spread + modulus_std**2 * np.einsum("px,py->pxy", values, values)
-            found[name] = Reaction(point, *map(VectorEstimate.of, values, spread))
+            found[name] = Reaction(place(mu), *map(VectorEstimate.of, values, spread))
         return found
 
     def forces(self, mu: Array) -> dict[str, tuple[Array, Array]]:
         """Point (3,), m, and force (3,), N, of each support at parameters (d,), in the object frame."""
-        return {name: (place(mu)[0], force(mu)[0]) for name, (place, force, _) in self._parts.items()}
+        return {name: (place(mu), force(mu)[0]) for name, (place, force, _) in self._parts.items()}
 
     @property
     def names(self) -> list[str]:
@@ -124,27 +122,41 @@ class Reactions:
         return list(self._parts)
 
 
-def _force_and_moment(fields: tuple[_Field, _Field, _Field], mu: Array) -> Array:
-    """Force of a support and moment about its point (2, 3) at parameters (d,)."""
-    point, force, about_origin = (field(mu)[0] for field in fields)
-    return np.stack([force, about_origin - np.cross(point, force)])
+def _values(fields: Sequence[_Field], mu: Array) -> Array:
+    """Values (k, 3) of k fields at parameters (d,)."""
+    return np.stack([field(mu)[0] for field in fields])
 
 
-def _fields_of(model: ReducedModel, name: str) -> tuple[_Field, _Field, _Field]:
-    """Place of a support, its force and its moment about the origin."""
+def _fields_of(model: ReducedModel, name: str) -> tuple[_Place, _Field, _Field]:
+    """Place of a support, its force, and its moment about the place.
+
+    Unknown loads have moments by the arms of the parametric state. So that about their place takes the place in that
+    state, too: how far they have moved it themselves is no arm.
+    """
     d = len(model.parameters)
 
     def nothing(mu: Array) -> tuple[Array, Array]:
         return np.zeros(3), np.zeros((d, 3))
 
-    place: _Field = nothing
-    if name == LOADS and model.energy is not None:
-        place = _place_of_loads(model, model.energy)
-    elif name in model.supports:
-        place = _place_of_support(model, model.supports[name])
+    force, moment = (model.reactions.get(kind + name) for kind in (FORCE, MOMENT))
+    assert force is not None
     # A moment that never exceeds rounding is not in the file.
-    moment = model.reactions.get(MOMENT + name)
-    return place, _of_one_point(model.reactions[FORCE + name]), nothing if moment is None else _of_one_point(moment)
+    of_force, about_origin = _of_one_point(force), nothing if moment is None else _of_one_point(moment)
+    if name == LOADS and model.energy is not None:
+        place, in_parametric_state = _places_of_loads(model, model.energy)
+        return place, of_force, _about(in_parametric_state, of_force, about_origin)
+    field = _place_of_support(model, model.supports[name]) if name in model.supports else nothing
+    return lambda mu: field(mu)[0], of_force, _about(field, of_force, about_origin)
+
+
+def _about(place: _Field, force: _Field, about_origin: _Field) -> _Field:
+    """The moment about a place, by the force and the moment about the origin."""
+
+    def of(mu: Array) -> tuple[Array, Array]:
+        (point, arms), (value, slopes), (moment, moments) = place(mu), force(mu), about_origin(mu)
+        return moment - np.cross(point, value), moments - np.cross(arms, value) - np.cross(point, slopes)
+
+    return of
 
 
 def _of_one_point(field: SeparatedField) -> _Field:
@@ -170,21 +182,27 @@ def _place_of_support(model: ReducedModel, held: NDArray[np.int64]) -> _Field:
     return place
 
 
-def _place_of_loads(model: ReducedModel, energy: ElasticEnergy) -> _Field:
-    """The mean of the deformed nodes by the square of the unknown loads' traction."""
+def _places_of_loads(model: ReducedModel, energy: ElasticEnergy) -> tuple[_Place, _Field]:
+    """The mean of the loads' nodes by the square of their traction: deformed, and as the study's parameters have them.
+
+    The slopes of the latter are those with the tractions as they are.
+    """
     held, alone = model.supports[LOADS], energy.model
     areas = node_areas(model, held)
 
-    def place(mu: Array) -> tuple[Array, Array]:
+    def weights(mu: Array) -> Array:
         # By their squares: small tractions all over the surface would draw the mean to its middle, and where a traction
         # counts from a least size on, the place jumps with each load that passes it.
-        weights = np.sum(energy.traction.value(mu)[held] ** 2, axis=1) * areas
-        weights /= max(float(weights.sum()), 1e-300)
-        positions = (model.nodes + model.displacement.value(mu))[held]
-        # As the surface is moved by the study's parameters; loads have their moments to first order.
-        slopes, own = np.zeros((len(mu), 3)), len(alone.parameters)
-        middle = np.tensordot(weights, alone.displacement.modes[:, held], axes=(0, 1))[:, None]
-        slopes[:own] = _of_one_point(alone.displacement.with_modes(middle))(mu[:own])[1]
-        return weights @ positions, slopes
+        found = np.sum(energy.traction.value(mu)[held] ** 2, axis=1) * areas
+        return np.asarray(found / max(float(found.sum()), 1e-300))
 
-    return place
+    def place(mu: Array) -> Array:
+        return np.asarray(weights(mu) @ (model.nodes + model.displacement.value(mu))[held])
+
+    def in_parametric_state(mu: Array) -> tuple[Array, Array]:
+        shares, own = weights(mu), len(alone.parameters)
+        middle = np.tensordot(shares, alone.displacement.modes[:, held], axes=(0, 1))[:, None]
+        value, slopes = _of_one_point(alone.displacement.with_modes(middle))(mu[:own])
+        return shares @ model.nodes[held] + value, np.concatenate([slopes, np.zeros((len(mu) - own, 3))])
+
+    return place, in_parametric_state
