@@ -1,4 +1,4 @@
-"""Which force of a run is its largest: closed-form lengths and deviations."""
+"""Which force of a run is its largest, and which displacement of a point: closed-form lengths and deviations."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
-from morph_dslam.tracking.run_folder import largest_forces
+from morph_dslam.tracking.run_folder import largest_forces, largest_of_points
 from tests.support.stretched_block import stretched_block_model
 
 NOTHING = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
@@ -64,3 +64,18 @@ def test_a_frame_that_is_not_to_be_relied_on_has_not_the_largest_force(mistaken,
     forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), 1e-4 * np.eye(3)) for size in (1.0, 2.0, 3.0)]
     (largest,) = largest_forces(run_of([4, 5, 6], "tip", forces, mistaken, torn))
     assert (largest["frame"], largest["force_N"]) == (frame, frame - 3.0)
+
+
+@pytest.mark.parametrize(("mistaken", "torn", "frame"), [((), (), 6), ((6,), (5, 6), 5), ((4, 5, 6), (), 6)])
+def test_a_frame_that_is_not_to_be_relied_on_has_not_the_largest_displacement_of_a_point(mistaken, torn, frame):
+    """4 mm, 5 mm and 6 mm, and as many degrees; behind a crack a point is seen to move as ever."""
+    moved, turned = (
+        [VectorEstimate.of(np.array([factor * size, 0.0, 0.0]), 1e-12 * np.eye(3)) for size in (4.0, 5.0, 6.0)]
+        for factor in (1e-3, np.radians(1.0))
+    )
+    run = run_of([4, 5, 6], "tip", [], mistaken, torn)
+    run.points, run.results = SimpleNamespace(rest=np.zeros((1, 3))), []
+    run.point_displacements, run.point_turns = lambda: {"tip": moved}, lambda: {"tip": turned}
+    (largest,) = largest_of_points(run)
+    assert (largest["frame"], largest["rotation_frame"]) == (frame, frame)
+    assert (largest["displacement_mm"], largest["rotation_deg"]) == pytest.approx((frame, frame))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import h5py
@@ -322,6 +322,7 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
     return summary
 
 
+_Value = TypeVar("_Value")
 #: A force is at least its length less so many standard deviations; where that is not positive, it may be zero.
 CERTAIN = 2.0
 
@@ -339,9 +340,7 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     doubtful = run.mistaken_frames | run.torn_frames
     for name, frames in run.reactions().items():
-        known = [(reaction, frame) for reaction, frame in zip(frames, run.frames, strict=True) if reaction is not None]
-        known = [one for one in known if one[1] not in doubtful] or known
-        if known:
+        if known := _known(frames, run, doubtful):
             # A length that consists of what is not determined is no force.
             largest, frame = max(
                 ((reaction.force, frame) for reaction, frame in known), key=lambda one: _certainty(one[0])
@@ -356,6 +355,12 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     return sorted(found, key=lambda figures: (not figures["differs_from_zero"], -float(figures["force_N"])))
 
 
+def _known(values: Sequence[_Value | None], run: RunResults, doubtful: Collection[int]) -> list[tuple[_Value, int]]:
+    """Those values (f,) of frames that are known, each with its frame; of ``doubtful`` ones if there are no others."""
+    known = [(value, frame) for value, frame in zip(values, run.frames, strict=True) if value is not None]
+    return [one for one in known if one[1] not in doubtful] or known
+
+
 def _certainty(force: VectorEstimate) -> tuple[bool, bool, float]:
     """Whether a force differs from zero, whether it is determined, and its size by that: the largest has the most."""
     least = force.size - CERTAIN * force.size_std
@@ -366,7 +371,10 @@ def _certainty(force: VectorEstimate) -> tuple[bool, bool, float]:
 
 
 def largest_of_points(run: RunResults) -> list[dict[str, Any]]:
-    """Of each named point its place, and its largest displacement and rotation, millimetres and degrees."""
+    """Of each named point its place, and its largest displacement and rotation, millimetres and degrees.
+
+    Frames that are not to be relied on count only if there are no others.
+    """
     found: list[dict[str, Any]] = []
     turns = run.point_turns()
     # A discrepancy is what the object has beyond the model, whatever that comes from.
@@ -386,7 +394,7 @@ def _largest(
     vectors: Sequence[VectorEstimate | None], run: RunResults, factor: float, names: tuple[str, str, str]
 ) -> dict[str, Any]:
     """The length, its deviation and the frame of the longest vector, by these names; nothing where there is none."""
-    known = [(vector, frame) for vector, frame in zip(vectors, run.frames, strict=True) if vector is not None]
+    known = _known(vectors, run, run.mistaken_frames)
     if not known:
         return {}
     largest, frame = max(known, key=lambda one: one[0].size)
