@@ -153,13 +153,16 @@ def test_an_interrupt_after_a_result_says_that_it_is_kept(monkeypatch, tmp_path,
 
 def test_a_force_that_no_frame_tells_from_zero_is_not_printed_as_one(tmp_path, capsys):
     clear = {"on": "z_min", "force_N": 74.2, "standard_deviation_N": 5.0, "frame": 19, "not_counted": []}
-    forces = [clear | {"differs_from_zero": True}]
+    clear |= {"at_bound": [], "differs_from_zero": True}
+    forces = [clear, clear | {"at_bound": ["push"]}]
     forces += [clear | {"on": "x_min", "force_N": 120.0, "standard_deviation_N": 330.0, "differs_from_zero": False}]
     print_summary(
         tmp_path, {"flags": [], "one_over_the_sequence": [], "largest_forces": forces} | dict.fromkeys(COUNTS, 1)
     )
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("largest")] == [
         "largest force, z_min: 74.2 ± 5 N in frame 19",
+        "largest force, z_min: 74.2 ± 5 N in frame 19, with 'push' at an end of its range: the object may be beyond, "
+        "and the force another",
         "largest force, x_min: no frame tells a force apart from zero; the largest is 120 ± 330 N in frame 19",
     ]
 

@@ -168,6 +168,14 @@ def test_shape_beyond_the_range_is_flagged():
     assert AtBound("arch") in found.warnings
 
 
+def test_an_object_that_is_undeformed_at_an_end_of_the_range_may_be_there():
+    arch, *others = MODEL.parameters
+    model = replace(MODEL, parameters=(replace(arch, default=arch.upper), *others))
+    found = register_landmarks(model, CAMERA, landmarks(State(np.array([arch.upper + 0.002, 0.25, -0.12]), POSE)))
+    assert found.state.parameters[0] == pytest.approx(arch.upper, abs=3e-3)
+    assert not [warning for warning in found.warnings if isinstance(warning, AtBound)]
+
+
 def test_bend_that_landmarks_cannot_decide_is_ambiguous():
     """A long way off the image of a shallow arch is nearly the same for both signs of a mirrored pose."""
     far = Camera(640, 480, 9000.0, 9000.0, 320.0, 240.0)

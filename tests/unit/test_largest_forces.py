@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from morph_dslam.tracking import run_folder
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
-from morph_dslam.tracking.run_folder import largest_forces, largest_of_points
+from morph_dslam.tracking.run_folder import largest_of_points
 from tests.support.stretched_block import stretched_block_model
 
 NOTHING = VectorEstimate.of(np.zeros(3), np.zeros((3, 3)))
@@ -22,6 +23,11 @@ def run_of(frames, support, forces, mistaken=(), torn=()):
         mistaken_frames=frozenset(mistaken),
         torn_frames=frozenset(torn),
     )
+
+
+def largest_forces(run, held=()):
+    """Of a run in whose frames ``held`` the first of two parameters is at an end of its range."""
+    return run_folder.largest_forces(run, np.array([[frame in held, False] for frame in run.frames]))
 
 
 def test_the_largest_force_is_that_which_is_largest_for_certain():
@@ -64,6 +70,12 @@ def test_a_frame_that_is_not_to_be_relied_on_has_not_the_largest_force(mistaken,
     forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), 1e-4 * np.eye(3)) for size in (1.0, 2.0, 3.0)]
     (largest,) = largest_forces(run_of([4, 5, 6], "tip", forces, mistaken, torn))
     assert (largest["frame"], largest["force_N"]) == (frame, frame - 3.0)
+
+
+def test_a_force_beyond_the_range_of_a_parameter_is_named():
+    forces = [VectorEstimate.of(np.array([size, 0.0, 0.0]), 1e-4 * np.eye(3)) for size in (1.0, 2.0, 3.0)]
+    run = run_of([4, 5, 6], "tip", forces)
+    assert [largest_forces(run, held)[0]["at_bound"] for held in ((), (4, 5), (6,))] == [[], [], ["stretch"]]
 
 
 @pytest.mark.parametrize(("mistaken", "torn", "frame"), [((), (), 6), ((6,), (5, 6), 5), ((4, 5, 6), (), 6)])

@@ -302,7 +302,10 @@ def test_a_range_that_is_left_is_named_in_all_frames_and_not_as_unobservable():
     run.add(2, 0.2, held(1e-3, 0.05, reference_factor=9.0))
     first, *others = notices_of(run)
     assert first == RunNotice.of(RunWarning.AT_BOUND, parameter="arch", side="upper", bound="60 mm", count=3)
-    assert [notice.warning for notice in others] == [RunWarning.REFERENCE_WIDENED]
+    assert others == []
+    inside = frame_result([0.02, 0.1, 0.0], [1e-3, 0.05, 0.01], [False] * 3)
+    run.add(3, 0.3, replace(inside, reference_factor=9.0))  # asked for by a frame that the model covers
+    assert [notice.warning for notice in notices_of(run)[1:]] == [RunWarning.REFERENCE_WIDENED]
 
 
 @pytest.mark.parametrize(

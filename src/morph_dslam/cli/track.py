@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
@@ -199,7 +200,7 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
                 "largest force, {on}: no frame tells a force apart from zero; the largest is {force_N:.3g} ± "
                 "{standard_deviation_N:.3g} N in frame {frame}"
             )
-        print(line.format(**figures) + _not_counted(figures))
+        print(line.format(**figures) + _beyond_range(figures["at_bound"]) + _not_counted(figures))
     for figures in summary.get("points", []):
         if "frame" in figures:
             line = "largest displacement of '{name}': {displacement_mm:.4g} ± {standard_deviation_mm:.2g} mm in frame "
@@ -219,6 +220,15 @@ def print_summary(folder: Path, summary: dict[str, Any]) -> None:
     # Of a live stream, frames that are skipped are those that were dropped.
     kinds = ("hidden", "lost") if "live" in summary else ("hidden", "lost", "skipped")
     print(line + "".join(f" {kind}={summary[f'n_{kind}']}" for kind in kinds if summary[f"n_{kind}"]))
+
+
+def _beyond_range(names: Sequence[str]) -> str:
+    """What parameters at an end of their range mean for the force of that frame."""
+    if not names:
+        return ""
+    ends = "an end of its range" if len(names) == 1 else "ends of their ranges"
+    said = " and ".join(f"'{name}'" for name in names)
+    return f", with {said} at {ends}: the object may be beyond, and the force another"
 
 
 def _not_counted(figures: dict[str, Any]) -> str:

@@ -319,10 +319,11 @@ def _warnings(fit: LandmarkFit, placed: _Placed, moved: NotAtRest | None) -> lis
         shapes = np.array([best.state.parameters, *(state.parameters for state in placed.alternatives)])
         is_one = (np.ptp(shapes, axis=0) <= SAME_SHAPE * (model.upper - model.lower)).all()
         found.append(Ambiguous(Ambiguity.TILT if is_one else Ambiguity.SHAPES, len(placed.alternatives) + 1))
-    # An unobservable parameter may lie anywhere, and one at rest is where it was said to be. Only an observable one
-    # that was sought says that the range ends too early.
-    box = fit.estimator.box
-    observable = (best.parameter_std < model.upper - model.lower) & (box.upper > box.lower)
+    # An unobservable parameter may lie anywhere, one at rest is where it was said to be, and the undeformed object may
+    # be at an end. Only an observable one that was sought elsewhere says that the range ends too early.
+    box, centre = fit.estimator.box, 0.5 * (model.lower + model.upper)
+    end = np.where(best.state.parameters > centre, model.upper, model.lower)
+    observable = (best.parameter_std < model.upper - model.lower) & (box.upper > box.lower) & (end != model.default)
     at_bound = zip(model.parameters, best.at_bound & observable, strict=True)
     found += [AtBound(parameter.name) for parameter, is_at_bound in at_bound if is_at_bound]
     other = other_unit(model, points, MOST_OF_IT) if extent(points) < PART_OF_IT * size else None

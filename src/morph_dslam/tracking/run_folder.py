@@ -35,7 +35,7 @@ from morph_dslam.tracking.observability import one_value
 from morph_dslam.tracking.reactions import Reaction, VectorEstimate
 from morph_dslam.tracking.repeated_pictures import RepeatedPictures
 from morph_dslam.tracking.result import STAGES, FrameResult
-from morph_dslam.tracking.run_notices import flags_of, notices_of
+from morph_dslam.tracking.run_notices import flags_of, held_at_bound, notices_of
 from morph_dslam.tracking.run_results import RunResults, contradictions
 from morph_dslam.tracking.sinks import TrackedFrame
 
@@ -313,7 +313,7 @@ def summarise(run: RunResults, notices: Sequence[Notice] = ()) -> dict[str, Any]
             "median": 1e3 * float(np.nanmedian(beyond)),
             "largest": 1e3 * float(np.nanmax(beyond)),
         }
-    summary["largest_forces"] = largest_forces(run)
+    summary["largest_forces"] = largest_forces(run, held_at_bound(run))
     summary["points"] = largest_of_points(run)
     summary["one_over_the_sequence"] = values_over_the_sequence(run)
     notices = [*notices, *notices_of(run)]
@@ -327,7 +327,7 @@ _Value = TypeVar("_Value")
 CERTAIN = 2.0
 
 
-def largest_forces(run: RunResults) -> list[dict[str, Any]]:
+def largest_forces(run: RunResults, at_bound: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """Of each support the force that is largest for certain, its standard deviation and frame; the largest one first.
 
     Where none differs from zero it is the largest one with a finite deviation, as so much may have acted; supports of
@@ -335,7 +335,8 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
     there are no others.
 
     The model's own error, which that deviation does not contain, stands beside it where its certificate states it: of
-    the reduction, and where it was estimated of the discretisation too.
+    the reduction, and where it was estimated of the discretisation too. So do the parameters that are held at an end of
+    their range in that frame, ``at_bound`` (f, d): the object may be beyond it, and the force another.
     """
     found: list[dict[str, Any]] = []
     doubtful = run.mistaken_frames | run.torn_frames
@@ -347,6 +348,8 @@ def largest_forces(run: RunResults) -> list[dict[str, Any]]:
             )
             figures = {"on": name, "force_N": largest.size, "standard_deviation_N": largest.size_std, "frame": frame}
             figures["differs_from_zero"], *_ = _certainty(largest)
+            held = zip(run.model.study_parameters, at_bound[run.frames.index(frame)], strict=True)
+            figures["at_bound"] = [parameter.name for parameter, is_held in held if is_held]
             figures["not_counted"] = uncounted(run.model)
             error = force_error(run.model, name)
             if error is not None:

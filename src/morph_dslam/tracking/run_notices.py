@@ -252,7 +252,7 @@ def _deformed_at_rest(run: RunResults) -> list[RunNotice]:
 
 def notices_of(run: RunResults) -> list[RunNotice]:
     """What a reader of the results must know."""
-    held = _held_at_bound(run)
+    held = held_at_bound(run)
     found, of, n_frames = _at_bound(run, held), RunNotice.of, len(run)
     lost = sum(result.status is Status.LOST for result in run.results)
     if lost:
@@ -263,7 +263,8 @@ def notices_of(run: RunResults) -> list[RunNotice]:
     torn = [(frame, r) for frame, r in zip(run.frames, run.results, strict=True) if r.jumps]
     if torn:
         found.append(of(RunWarning.SURFACE_JUMPS, first=torn[0][0], where=largest_jump(torn[-1][1].jumps).text))
-    factor = float(np.max(run.reference_factors(), initial=1.0))
+    # Frames beyond the model's range ask for more whatever the law and the landmarks: they have a notice of their own.
+    factor = float(np.max(run.reference_factors()[~held.any(axis=1)], initial=1.0))
     if factor > CLEARLY_WORSE:
         found.append(of(RunWarning.REFERENCE_WIDENED, factor=factor))
     beside = supports_beside_loads(run.model)
@@ -366,7 +367,7 @@ def _frames(count: int) -> str:
     return f"{count} frame{'s' * (count != 1)}"
 
 
-def _held_at_bound(run: RunResults) -> NDArray[np.bool_]:
+def held_at_bound(run: RunResults) -> NDArray[np.bool_]:
     """Where (f, d) the images put a parameter to an end of its range, unless the undeformed object has it there.
 
     A deviation as wide as the range leaves open where the parameter is. But the farther the object is outside of the
