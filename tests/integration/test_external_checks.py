@@ -253,6 +253,24 @@ def test_states_along_one_history_leave_the_box_empty(tmp_path):
     assert re.match(r"the solutions leave \d+ % of the parameter box empty", warning)
 
 
+def test_a_parameter_without_an_effect_is_named(tmp_path):
+    """The last of three columns is random; of the others the block's sides know only one each."""
+    states = np.column_stack([scattered(), np.random.default_rng(1).uniform(-20.0, 60.0, 30)])
+
+    def without_heat(_, pull, shear, heat):
+        size = np.array([np.sin(6.0 * pull), np.exp(-4.0 * shear), 0.3 * pull * shear])  # no polynomials
+        return {"U": 0.1 * POINTS * size}
+
+    header = "file, pull [1], shear [1], heat [1]"
+    (warning,) = made(write(tmp_path / "a", states, without_heat, header=header))[1]
+    assert warning.startswith("parameter 'heat' has no effect that the solutions show")
+
+    def with_heat(number, *state):
+        return {"U": without_heat(number, *state)["U"] + 3e-4 * state[2] * POINTS[:, ::-1]}
+
+    assert made(write(tmp_path / "b", states, with_heat, header=header))[1] == []
+
+
 def test_defaults_are_those_of_the_study(tmp_path):
     folder = write(tmp_path, scattered(), moved, '[external.defaults]\npull = "0.31"')
     assert [parameter.default for parameter in made(folder)[0].parameters] == pytest.approx([0.31, 0.0])

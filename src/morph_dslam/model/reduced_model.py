@@ -403,7 +403,9 @@ class DeformedState:
         return self._value("strain", points)
 
     def stress(self, place: str | None = None, points: Points | None = None) -> Array:
-        """Stress (n, 6) of a solid or (n, 3) on a face of a sheet, pascals (`ReducedModel.stresses`).
+        """Stress of a solid (n, 6), xx, yy, zz, yz, xz, xy, or on a face of a sheet (n, 3), pascals.
+
+        Of its axes see `ReducedModel.stresses`.
 
         Parameters
         ----------

@@ -160,8 +160,8 @@ class ExternalStudy(Section):
         return fields
 
     def doubts(self, snapshots: Sequence[Snapshot]) -> list[str]:
-        """Sentences on solutions that the others contradict, and on where the box of parameters is empty."""
-        table, _, coordinates, _ = self._table()
+        """Sentences on what is doubtful about the solutions."""
+        table, parameters, coordinates, _ = self._table()
         places = {
             point.tobytes(): f"{table.path.name}, line {line}, '{row['file']}'"
             for point, line, row in zip(coordinates, table.lines, table.rows, strict=True)
@@ -172,7 +172,7 @@ class ExternalStudy(Section):
         for name in snapshots[0].fields:
             values = np.array([snapshot.fields[name].ravel() for snapshot in snapshots])
             grams[name] = values @ values.T
-        return doubts(coordinates, grams, list(places.values()))
+        return doubts(coordinates, [parameter.name for parameter in parameters], grams, list(places.values()))
 
     def split(self, count: int) -> tuple[list[int], list[int]]:
         """Training and held-out solutions, by index."""

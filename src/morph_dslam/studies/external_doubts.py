@@ -1,4 +1,6 @@
-"""What is doubtful about solutions of another program: states that the others contradict, and empty parts of the box.
+"""What is doubtful about solutions of another program.
+
+States that the others contradict, parameters without an effect, and empty parts of the box.
 
 Each finding is a sentence for whoever builds the model; right tables have none.
 """
@@ -146,6 +148,28 @@ def _is_between(others: Array, sample: Array) -> bool:
     return bool(missed < 1e-9)
 
 
+def without_effect(samples: Array, grams: Sequence[Array]) -> Indices:
+    """Parameters (k,) without which polynomials predict all fields of states that were left out at least as well.
+
+    Parameters
+    ----------
+    samples : (n, d) parameters, from -1 to 1.
+    grams : (n, n) scalar products of the states' fields, of each field.
+    """
+    every = np.arange(len(samples))
+
+    def error(columns: Array, gram: Array) -> float:
+        least = ROUNDING * np.sqrt(float(np.diag(gram).max()))
+        return max(min((fit.error for fit in _fits(columns, gram, every, HIGHEST)), default=np.inf), least)
+
+    def has_none(k: int) -> bool:
+        others = np.delete(samples, k, axis=1)
+        return all(error(others, gram) <= error(samples, gram) < np.inf for gram in grams)
+
+    d = samples.shape[1]
+    return np.array([k for k in range(d) if d > 1 and has_none(k)], dtype=np.int64)
+
+
 def empty_share(samples: Array) -> float:
     """Share of the box that is far from all samples (n, d), from 0 to 1, in comparison with as many scattered ones."""
     rng = np.random.default_rng(0)
@@ -164,12 +188,13 @@ def scaled(values: Array) -> Array:
     return (values - lower) / (values.max(axis=0) - lower)
 
 
-def doubts(samples: Array, grams: dict[str, Array], places: Sequence[str]) -> list[str]:
-    """Sentences on the states of a table, one on each state that is far off.
+def doubts(samples: Array, names: Sequence[str], grams: dict[str, Array], places: Sequence[str]) -> list[str]:
+    """Sentences on a table: one on each state that is far off, and on each parameter without an effect.
 
     Parameters
     ----------
     samples : (n, d) parameters, SI.
+    names : of the d parameters.
     grams : (n, n) scalar products of the states' fields by name, the most important first.
     places : file and line of each state, for people.
     """
@@ -178,6 +203,11 @@ def doubts(samples: Array, grams: dict[str, Array], places: Sequence[str]) -> li
         for off in far_off(2.0 * filling - 1.0, gram):
             sentences.setdefault(off.index, f"{places[off.index]}: {_far_off(name.removesuffix('_solid'), off)}")
     found = [sentence for _, sentence in sorted(sentences.items())]
+    found += [
+        f"parameter '{names[k]}' has no effect that the solutions show: those left out are predicted as well without "
+        "it; leave its column out, as it costs accuracy and images cannot show it"
+        for k in without_effect(2.0 * filling - 1.0, list(grams.values()))
+    ]
     share = empty_share(filling) if samples.shape[1] > 1 else 0.0
     if share > EMPTY:
         found.append(
