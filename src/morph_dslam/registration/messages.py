@@ -329,23 +329,6 @@ class OtherSize(RegistrationWarning):
     ratio: float
 
 
-@dataclass(frozen=True)
-class MapNotRigid(RegistrationWarning):
-    """The scene of the map did not stay rigid while it was mapped.
-
-    Attributes
-    ----------
-    correlation : of the misses of neighbouring map points, as of `SceneNotRigid`.
-    """
-
-    template: ClassVar[str] = (
-        "registration doubtful: the scene of the map did not stay rigid while it was mapped (correlation "
-        "{correlation:.2f} of neighbouring points), so that the object may be off by far more than is stated; map the "
-        "scene again without what moves"
-    )
-    correlation: float
-
-
 #: Units that meshes come in, metres.
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 1e-3, "inches": 0.0254}
 #: Those that landmarks may be in by mistake, in millimetres, which they should be in.

@@ -18,16 +18,8 @@ from morph_dslam.model import ReducedModel
 from morph_dslam.model.discrepancy import Discrepancy
 from morph_dslam.model.revolution import with_revolution_angle
 from morph_dslam.notices import Notice
-from morph_dslam.registration.messages import (
-    Ambiguous,
-    AngleOpen,
-    MapNotRigid,
-    OtherValues,
-    OutlineElsewhere,
-    TurnArbitrary,
-)
+from morph_dslam.registration.messages import Ambiguous, AngleOpen, OtherValues, OutlineElsewhere, TurnArbitrary
 from morph_dslam.slam.pose import PoseEstimate
-from morph_dslam.slam.scene_rigidity import SceneNotRigid
 from morph_dslam.tracking.depth_scale import DepthScale
 from morph_dslam.tracking.state import Prior, State, pose_increment
 
@@ -247,9 +239,8 @@ class Registration:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether another registration is nearly as good, or the images or the map do not confirm this one."""
-        kinds = Ambiguous | OtherValues | OutlineElsewhere | MapNotRigid
-        return any(isinstance(warning, kinds) for warning in self.warnings)
+        """Whether another registration is nearly as good, or the images do not confirm this one."""
+        return any(isinstance(warning, Ambiguous | OtherValues | OutlineElsewhere) for warning in self.warnings)
 
     def pose_deviations(self) -> tuple[float, float] | None:
         """Standard deviations of the mean node's place, metres, and of the attitude, rad, in the reference frame.
@@ -370,9 +361,6 @@ def registration_in_map(
     by_frame = {view.frame: view for view in keyframes}
     chosen = by_frame[max(by_frame) if frame is None else frame]
     open_angles: tuple[str, ...] = ()
-    if scene is not None:
-        of_map = [MapNotRigid(found.correlation) for found in scene.notices if isinstance(found, SceneNotRigid)]
-        warnings = [*warnings, *of_map]
     if axis is not None:
         warnings = [w for w in warnings if not isinstance(w, AngleOpen | TurnArbitrary)]
         if model.parameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,7 +26,6 @@ from morph_dslam.slam.options import INLIER_PX, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, inside, reprojection_errors
 from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
 from morph_dslam.slam.rolling_shutter import velocities
-from morph_dslam.slam.scene_rigidity import SceneNotRigid
 from morph_dslam.slam.templates import image_pyramid
 from morph_dslam.slam.tracking import Tracked, Tracker, ViewsOf
 from morph_dslam.sources import FrameSource
@@ -148,8 +147,6 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
     with written_with_checksum(path, FORMAT) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["camera_notes"] = json.dumps(rigid_map.camera_notes)
-        not_rigid = [asdict(notice) for notice in rigid_map.notices if isinstance(notice, SceneNotRigid)]
-        file.attrs["scene_not_rigid"] = json.dumps(not_rigid)
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs["has_given_lengths"] = rigid_map.has_given_lengths
         file.attrs["renumbered"] = json.dumps(rigid_map.renumbered)
@@ -272,8 +269,6 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
     notes = json.loads(str(file.attrs.get("camera_notes", "[]")))
     rigid_map.camera_notes = (*notes, *_lens_note(path, file, camera))
-    not_rigid = json.loads(str(file.attrs.get("scene_not_rigid", "[]")))  # maps of earlier releases do not say
-    rigid_map.notices = tuple(SceneNotRigid(**found) for found in not_rigid)
     for name in POINT_ARRAYS:
         setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))
     rigid_map.merged_into = np.arange(len(rigid_map.state))

@@ -131,11 +131,11 @@ class Scene:
         if slam is not None and slam.knows_map:
             # Another lens or zoom puts points of a part of the picture elsewhere, too.
             if self._notes_in_known_map:
-                return self.map.notices
+                return ()
             part = moved_part(self.map, self.camera, self.trajectory, slam.seen_in_known_map, slam.astray_in_known_map)
-            return self.map.notices if part is None else (*self.map.notices, part)
+            return () if part is None else (part,)
         if self.slam is None or estimate is None:
-            return self.map.notices
+            return ()
         seen = _seen(self.slam, self.frames, self.trajectory)
         found = motion_in_scene(self.map, self.camera, estimate.camera, self.trajectory, seen)
         return () if found is None else (found,)
@@ -148,7 +148,7 @@ class Scene:
         """
         estimate, found = self.camera_estimate(), tuple(notice.text for notice in self.notices)
         if estimate is None:
-            notes = tuple(dict.fromkeys((*found, *self.map.camera_notes)))
+            notes = (*found, *self.map.camera_notes)
         else:
             notes = found or tuple(camera_notes(estimate, refined=self.refined))
         if self.slam is None:
@@ -189,7 +189,6 @@ class Scene:
         """Write map and path into one file, which `load_scene` and the commands read."""
         try:
             self.map.camera_notes = self.camera_notes or self.map.camera_notes
-            self.map.notices = self.notices
         finally:  # a check of the camera that fails must not cost the map
             save_map(Path(path), self.map, self.camera, self.trajectory)
 
