@@ -24,7 +24,7 @@ from morph_dslam.registration.registration import (
     registration_in_map,
     state_covariance,
 )
-from morph_dslam.registration.scene import View, camera_from_object, points_and_views
+from morph_dslam.registration.scene import View, camera_from_object, map_warnings, points_and_views
 from morph_dslam.registration.starts import solve_pnp
 from morph_dslam.registration.texture import moved_similarity, pose_jacobian
 from morph_dslam.slam.scene import Scene
@@ -243,7 +243,7 @@ def register_board(scene: Scene, model: ReducedModel, board: FiducialBoard | str
     }
     keyframes = [KeyframePose(view.frame, camera_from_object(view, placed)) for view in views]
     in_map = MapRegistration(placed, mean_node, _about(found.covariance, arm))
-    warnings: list[RegistrationWarning] = [AssumedUndeformed()]
+    warnings: list[RegistrationWarning] = [AssumedUndeformed(), *map_warnings(scene)]
     if found.open_order:
         warnings.append(Ambiguous(Ambiguity.BOARD_TAGS))
     return registration_in_map(model, in_map, keyframes, facts, warnings, scene=scene)

@@ -286,6 +286,10 @@ class EdgeEvidence:
         """Whether its gain is less than another one by more than the keyframes leave open."""
         return self.gain + ONE_SIDED * self.gain_std < gain
 
+    def is_above(self, gain: float) -> bool:
+        """Whether its gain is more than another one by more than the keyframes leave open."""
+        return self.gain - ONE_SIDED * self.gain_std > gain
+
 
 def _beyond_chance(share: float, chance: float) -> float:
     """How much a share exceeds that by chance, of what it could."""

@@ -87,8 +87,9 @@ class MeshRegistration:
     keyframes : those with a pose of their own about the object; None if there was too little to compare, or the images
         do not show its shape.
     outline : how much of its outline the keyframes show where it is.
-    unconfirmed : whether there are images, but nothing on the object could be compared in them: a floor and a
-        wall, say, that have its shape in another size; or no image shows any of its outline.
+    unconfirmed : what too little confirms: a place where nothing on the object could be compared in the images, as
+        between a floor and a wall that have its shape in another size, or where no image shows any of its outline; or
+        one that landmarks alone speak for. None if enough does.
     edges : how much of its edges the keyframes show, if it was found by these or they contradict the points.
     shape_shown : whether the images agree on the surface as they would on no flat one.
     unrefined : why the images did not refine the place; None if they did, or agree with it.
@@ -103,7 +104,7 @@ class MeshRegistration:
     axis: Axis | None
     keyframes: AdjustedKeyframes | None = None
     outline: OutlineFit = field(default_factory=OutlineFit)
-    unconfirmed: bool = False
+    unconfirmed: Ambiguity | None = None
     edges: EdgeEvidence | None = None
     shape_shown: bool = False
     unrefined: RegistrationWarning | None = None
@@ -120,8 +121,8 @@ class MeshRegistration:
         if self.outline.contradicts or self._lacks_edges:
             by_edges = self.edges if self._lacks_edges else None
             warnings.append(OutlineElsewhere(self.outline.share if by_edges is None else by_edges.gain))
-        elif self.unconfirmed:
-            warnings.append(Ambiguous(Ambiguity.UNCONFIRMED))
+        elif self.unconfirmed is not None:
+            warnings.append(Ambiguous(self.unconfirmed))
         elif self.rms_px is not None and self.rms_px > POOR_AGREEMENT_PX:
             warnings.append(Ambiguous(Ambiguity.IMAGES_DIFFER, self.rms_px))
         elif self.runner_up > max(AMBIGUOUS * self.score, 0.0):
@@ -196,7 +197,7 @@ def register_mesh(
         return by_edges()
     if not there.edges.count and not found.shape_shown:
         # Large enough, an object fits around everything, and its surface to any plane.
-        return replace(found, unconfirmed=True)
+        return replace(found, unconfirmed=Ambiguity.UNCONFIRMED)
     informative = 0.0 < there.edges.chance < TELLING_CHANCE and there.edges.gain < AGAINST
     contradicts = informative and there.edges.is_below(AGAINST if found.shape_shown else OUTLINE_SHOWN)
     return replace(found, edges=there.edges) if contradicts else found
@@ -235,7 +236,7 @@ def _by_edges(
         None,
         axis,
         outline=outline_fit(best.place, nodes, triangles, asked, search.camera),
-        unconfirmed=not by_clicks and score < CONFIRMED,
+        unconfirmed=_doubt(best, by_clicks),
         edges=best.edges,
     )
     comparison = TextureComparison(nodes, triangles, search.camera)
@@ -267,7 +268,31 @@ def _by_edges(
     rivals = tuple(
         rival for rival in found.rivals if not search.same(rival.world_from_object, adjusted.world_from_object)
     )
-    return replace(adjusted, edges=there.edges, outline=outline, rivals=rivals)
+    # Images that show its shape confirm where landmarks have it.
+    unconfirmed = None if by_clicks else found.unconfirmed
+    return replace(adjusted, edges=there.edges, outline=outline, rivals=rivals, unconfirmed=unconfirmed)
+
+
+def _doubt(best: EdgeRegistration, by_clicks: bool) -> Ambiguity | None:
+    """What too little of edges and points confirms about a place; None if enough does.
+
+    Of a smooth body that landmarks place there may be few points; but its outline must be seen beyond doubt, and the
+    points that there are must not contradict it.
+    """
+    if 100.0 * best.rank >= CONFIRMED:
+        return None
+    if not by_clicks:
+        return Ambiguity.UNCONFIRMED
+    is_shown = best.edges.is_above(OUTLINE_SHOWN) and not best.points.contradicts
+    return None if is_shown else Ambiguity.LANDMARKS_UNCONFIRMED
+
+
+def doubted(found: MeshRegistration) -> MeshRegistration:
+    """A registration by a map that is in doubt itself: landmarks, which rest on it, need its edges or images, too."""
+    is_confirmed = found.edges is None or found.score >= CONFIRMED or found.shape_shown
+    if is_confirmed or found.unconfirmed is not None:
+        return found
+    return replace(found, unconfirmed=Ambiguity.LANDMARKS_UNCONFIRMED)
 
 
 def _why_not_compared(
@@ -297,7 +322,7 @@ def _by_points(search: EdgeSearch, points: MapPoints, views: Sequence[View], pro
         found = replace(found, unrefined=_why_not_compared(comparison, search, found.world_from_object, views))
     outline = outline_fit(found.world_from_object, nodes, triangles, spread_views(views, MOST_ASKED), camera)
     unconfirmed = found.rms_px is None and any(np.ptp(view.normalized) > 0 for view in views)
-    return replace(found, outline=outline, unconfirmed=unconfirmed)
+    return replace(found, outline=outline, unconfirmed=Ambiguity.UNCONFIRMED if unconfirmed else None)
 
 
 def _best_rivals(others: list[Rival]) -> tuple[Rival, ...]:

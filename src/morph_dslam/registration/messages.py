@@ -26,6 +26,7 @@ class Ambiguity(StrEnum):
     TWO_PRINTS = "two_prints"
     SECOND_PLACE = "second_place"
     UNCONFIRMED = "unconfirmed"
+    LANDMARKS_UNCONFIRMED = "landmarks_unconfirmed"
     IMAGES_DIFFER = "images_differ"
     TURNED = "turned"
 
@@ -44,6 +45,8 @@ _AMBIGUITIES = {
     "and give landmarks if it is wrong",
     Ambiguity.UNCONFIRMED: "no image confirms this place, and scenery that has the object's shape in another size "
     "would do; look at registration.jpg, and give landmarks if it is wrong",
+    Ambiguity.LANDMARKS_UNCONFIRMED: "the landmarks alone speak for this place, and the map does not confirm it; look "
+    "at registration.jpg: a landmark may belong to another point, or the map or the camera file be wrong",
     Ambiguity.IMAGES_DIFFER: "the keyframes' images differ by {value:.2f} px on the object; look at "
     "registration.jpg, and give landmarks if it is wrong",
     Ambiguity.TURNED: "undeformed, the object looks the same turned by {value:.0f} degrees, but it does not deform the "
@@ -564,6 +567,22 @@ class MeshOffSurface(RegistrationWarning):
             "deviations contain: register the surface itself (`morph build --rigid`), and track the model with that "
             "registration"
         )
+
+
+@dataclass(frozen=True)
+class MapNotRigid(RegistrationWarning):
+    """The map says of itself that its scene did not stay rigid.
+
+    Attributes
+    ----------
+    correlation : of the misses of neighbouring points in the map, near 0 in a rigid scene.
+    """
+
+    template: ClassVar[str] = (
+        "the object was placed in a map whose scene did not stay rigid (correlation {correlation:.2f}): its place and "
+        "the size of the map's unit may be off by far more than is stated; map the scene again without what moves"
+    )
+    correlation: float
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,11 @@ class PointEvidence:
         return float(self.solid.sum() - VIOLATION * self.occluded.sum())
 
     @property
+    def contradicts(self) -> bool:
+        """Whether the object would occlude more of the points than it explains."""
+        return bool(self.occluded.sum() > self.explained.sum())
+
+    @property
     def agreement(self) -> float:
         """How far the points where it is seen agree, -1 to 1; near 0 where there are few or they lie in one plane."""
         explained = float(self.explained.sum())

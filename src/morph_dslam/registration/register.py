@@ -32,7 +32,7 @@ from morph_dslam.registration.landmark_binding import (
     on_surface,
 )
 from morph_dslam.registration.landmark_fit import check_at_rest
-from morph_dslam.registration.mesh import MeshRegistration, register_in_unit, same_size
+from morph_dslam.registration.mesh import MeshRegistration, doubted, register_in_unit, same_size
 from morph_dslam.registration.messages import MeshOffSurface, OnlyInBox, OtherSize
 from morph_dslam.registration.rectification import inverse_depths_at
 from morph_dslam.registration.registration import (
@@ -44,7 +44,15 @@ from morph_dslam.registration.registration import (
     registration_in_map,
 )
 from morph_dslam.registration.registration_file import load_registration, read_content
-from morph_dslam.registration.scene import MapPoints, View, camera_from_object, points_and_views, views_apart, views_of
+from morph_dslam.registration.scene import (
+    MapPoints,
+    View,
+    camera_from_object,
+    map_warnings,
+    points_and_views,
+    views_apart,
+    views_of,
+)
 from morph_dslam.registration.symmetry import turn_warning
 from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
@@ -109,6 +117,8 @@ def register(
     found = register_in_unit(
         nodes, model.triangles, points, views, scene.camera, scene.is_metric, progress, hints, claimed
     )
+    of_map = map_warnings(scene)
+    found = doubted(found) if of_map else found
     facts = {
         "from": "map",
         "score": found.score,
@@ -120,7 +130,7 @@ def register(
     }
     in_map = MapRegistration(found.world_from_object, nodes.mean(axis=0), found.covariance)
     keyframes = _keyframes(found, views)
-    warnings = found.warnings
+    warnings = (*found.warnings, *of_map)
     if off := mesh_off_surface(model):
         factors = mesh_error_factors(off, nodes, in_map.world_from_object.scale)
         in_map, keyframes = with_mesh_error(in_map, keyframes, factors)

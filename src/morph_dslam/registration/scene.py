@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from morph_dslam.camera import Camera
 from morph_dslam.geometry import RigidTransform, SimilarityTransform
+from morph_dslam.registration.messages import MapNotRigid
 from morph_dslam.registration.rectification import rectified_image
 from morph_dslam.slam.rigid_map import GOOD
 from morph_dslam.slam.rolling_shutter import middle_row_pixels
 from morph_dslam.slam.scene import Scene
+from morph_dslam.slam.scene_rigidity import SceneNotRigid
 from morph_dslam.tracking.depth import SCALE_STD
 
 Array = NDArray[np.float64]
@@ -58,6 +60,11 @@ class View:
     point_ids: NDArray[np.int64]
     pixels: Array
     depths: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), dtype=np.float32))
+
+
+def map_warnings(scene: Scene) -> tuple[MapNotRigid, ...]:
+    """What a scene's map says against all that is placed in it."""
+    return tuple(MapNotRigid(found.correlation) for found in scene.notices if isinstance(found, SceneNotRigid))
 
 
 def points_and_views(scene: Scene) -> tuple[MapPoints, Sequence[View]]:

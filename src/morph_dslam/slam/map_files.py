@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from morph_dslam.io.checksum import check_checksum, is_other_hdf5, written_with_
 from morph_dslam.io.colmap import ColmapImage, ColmapModel
 from morph_dslam.io.file_kinds import file_kind
 from morph_dslam.io.trajectory import Trajectory
+from morph_dslam.notices import Notice
 from morph_dslam.slam.frame_images import FrameImages, FrameView
 from morph_dslam.slam.given_poses import PoseCheck
 from morph_dslam.slam.mapping import Mapper, do_all
@@ -26,6 +27,7 @@ from morph_dslam.slam.options import INLIER_PX, LEAST_START_POINTS, PATCH_HALF
 from morph_dslam.slam.pose import PoseEstimate, inside, reprojection_errors
 from morph_dslam.slam.rigid_map import GOOD, NOWHERE, POINT_ARRAYS, Followed, Keyframe, RigidMap
 from morph_dslam.slam.rolling_shutter import velocities
+from morph_dslam.slam.scene_rigidity import SceneNotRigid
 from morph_dslam.slam.templates import image_pyramid
 from morph_dslam.slam.tracking import Tracked, Tracker, ViewsOf
 from morph_dslam.sources import FrameSource
@@ -147,6 +149,7 @@ def save_map(path: Path, rigid_map: RigidMap, camera: Camera, trajectory: Trajec
     with written_with_checksum(path, FORMAT) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "usual_rms_px": rigid_map.usual_rms_px})
         file.attrs["camera_notes"] = json.dumps(rigid_map.camera_notes)
+        file.attrs["notices"] = json.dumps([notice.content() for notice in rigid_map.notices])
         file.attrs["baseline_px"] = rigid_map.baseline_px
         file.attrs["has_given_lengths"] = rigid_map.has_given_lengths
         file.attrs["renumbered"] = json.dumps(rigid_map.renumbered)
@@ -258,6 +261,12 @@ def _has_given_lengths(file: h5py.File) -> bool:
     return bool(np.asarray(file.attrs.get("has_given_lengths", False)))
 
 
+def _notices(file: h5py.File) -> tuple[Notice, ...]:
+    """What its recording showed to be wrong with a map; nothing of maps of earlier releases, which do not say."""
+    contents = json.loads(str(file.attrs.get("notices", "[]")))
+    return tuple(SceneNotRigid(**{each.name: found[each.name] for each in fields(SceneNotRigid)}) for found in contents)
+
+
 def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     _check_camera(path, file, camera)
     keyframes = file.get("keyframes")
@@ -269,6 +278,7 @@ def _read(path: Path, file: h5py.File, camera: Camera) -> RigidMap:
     rigid_map.usual_rms_px = float(np.asarray(file.attrs["usual_rms_px"]))
     notes = json.loads(str(file.attrs.get("camera_notes", "[]")))
     rigid_map.camera_notes = (*notes, *_lens_note(path, file, camera))
+    rigid_map.notices = _notices(file)
     for name in POINT_ARRAYS:
         setattr(rigid_map, name, np.asarray(file[f"points/{name}"]))
     rigid_map.merged_into = np.arange(len(rigid_map.state))

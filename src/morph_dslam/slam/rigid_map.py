@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from morph_dslam.notices import Notice
 from morph_dslam.slam.frame_images import OCTAVES, FrameView, describe
 from morph_dslam.slam.pose import inverse, reprojection_errors
 
@@ -249,6 +250,7 @@ class RigidMap:
     renumbered : what each recording that it grew by added to the numbers of all keyframes before, the latest last.
     passing : frames that are not kept, but tell which candidates move.
     camera_notes : what its recording showed to be wrong with its camera, for people.
+    notices : what its recording showed to be wrong with the map itself.
     """
 
     def __init__(self, baseline_px: float = 0.0) -> None:
@@ -256,6 +258,7 @@ class RigidMap:
         self.keyframes: list[Keyframe] = []
         self.usual_rms_px = FIRST_RMS_PX
         self.camera_notes: tuple[str, ...] = ()
+        self.notices: tuple[Notice, ...] = ()
         self.has_given_lengths = False
         self.renumbered: tuple[int, ...] = ()
         self.passing = PassingViews()
@@ -295,7 +298,7 @@ class RigidMap:
         """Another map that is what this one is now, and may change by itself."""
         other = RigidMap(self.baseline_px)
         other.camera_notes, other.has_given_lengths = self.camera_notes, self.has_given_lengths
-        other.renumbered = self.renumbered
+        other.renumbered, other.notices = self.renumbered, self.notices
         other.copy_of(self)
         return other
 

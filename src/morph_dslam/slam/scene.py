@@ -42,7 +42,7 @@ from morph_dslam.slam.relocalization import bit_counts
 from morph_dslam.slam.result import STAGES, SlamFrame, SlamStatus
 from morph_dslam.slam.rigid_map import Followed, Keyframe, RigidMap
 from morph_dslam.slam.run_notes import run_notes, why_without_poses
-from morph_dslam.slam.scene_rigidity import motion_in_scene
+from morph_dslam.slam.scene_rigidity import SceneNotRigid, motion_in_scene
 from morph_dslam.slam.second_pass import find_rest
 from morph_dslam.slam.self_calibration import estimate_camera
 from morph_dslam.slam.slam import Slam
@@ -126,16 +126,19 @@ class Scene:
 
     @cached_property
     def notices(self) -> tuple[Notice, ...]:
-        """That the scene did not stay rigid, or a part of a known map was moved, if the recording shows it."""
+        """That the scene did not stay rigid, or a part of a known map was moved, if a recording shows it.
+
+        The first is kept with the map, and is true of it in all later recordings.
+        """
         estimate, slam = self.camera_estimate(), self.slam
         if slam is not None and slam.knows_map:
             # Another lens or zoom puts points of a part of the picture elsewhere, too.
             if self._notes_in_known_map:
-                return ()
+                return self.map.notices
             part = moved_part(self.map, self.camera, self.trajectory, slam.seen_in_known_map, slam.astray_in_known_map)
-            return () if part is None else (part,)
+            return self.map.notices if part is None else (*self.map.notices, part)
         if self.slam is None or estimate is None:
-            return ()
+            return self.map.notices
         seen = _seen(self.slam, self.frames, self.trajectory)
         found = motion_in_scene(self.map, self.camera, estimate.camera, self.trajectory, seen)
         return () if found is None else (found,)
@@ -152,7 +155,7 @@ class Scene:
         else:
             notes = found or tuple(camera_notes(estimate, refined=self.refined))
         if self.slam is None:
-            return notes
+            return tuple(dict.fromkeys(notes))
         if self.slam.knows_map and not len(self.trajectory):
             notes = found  # others are of another recording, and perhaps of another camera
         elif self.slam.knows_map:
@@ -189,6 +192,7 @@ class Scene:
         """Write map and path into one file, which `load_scene` and the commands read."""
         try:
             self.map.camera_notes = self.camera_notes or self.map.camera_notes
+            self.map.notices = tuple(notice for notice in self.notices if isinstance(notice, SceneNotRigid))
         finally:  # a check of the camera that fails must not cost the map
             save_map(Path(path), self.map, self.camera, self.trajectory)
 
