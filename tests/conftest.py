@@ -37,6 +37,18 @@ BLANK = {
 
 def pytest_configure(config):
     cv2.setNumThreads(1)
+    gc.disable()  # until all is imported
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """One worker compiles a file of tests, and the others read what it has left; each would compile all files."""
+    if "PYTEST_XDIST_WORKER" not in os.environ or not isinstance(collector, pytest.Module):
+        return (yield)
+    lock = Path(collector.config.option.basetemp).parent / f"{collector.nodeid.replace('/', '.')}.lock"
+    with lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return (yield)
 
 
 def pytest_collection_modifyitems(items):
@@ -46,9 +58,14 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """All that is imported stays: to look for garbage in it takes a tenth of a second, at each run of a tracker."""
+    """All that is imported stays: to look for garbage in it takes a tenth of a second, at each run of a tracker.
+
+    What is compiled stays too: where garbage is looked for as often as Python does, that takes a tenth of compiling.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
