@@ -269,6 +269,10 @@ def test_a_parameter_without_an_effect_is_named(tmp_path):
         return {"U": without_heat(number, *state)["U"] + 3e-4 * state[2] * POINTS[:, ::-1]}
 
     assert made(write(tmp_path / "b", states, with_heat, header=header))[1] == []
+    # Few states show no more than a plane; others' curvature must not count against a parameter.
+    few = np.column_stack([np.tile([-1.0, -0.4, 0.1, 0.6, 1.0], 4), np.repeat([-1.0, -0.2, 0.4, 1.0], 5)])
+    curved = write(tmp_path / "c", few, lambda _, a, b: {"U": (0.1 * np.sin(3.0 * a) + 0.005 * b) * POINTS})
+    assert not [text for text in made(curved)[1] if "no effect" in text]
 
 
 def test_defaults_are_those_of_the_study(tmp_path):
