@@ -31,6 +31,19 @@ def test_coordinates_are_in_the_units_of_studies():
         assert set(choices) == set(FACTORS["length"])
 
 
+def test_commands_multiply_matrices_in_one_thread(tmp_path):
+    program = """
+from morph_dslam.cli import main
+main(["info", "absent.morph"])
+from threadpoolctl import threadpool_info
+print(*(pool["num_threads"] for pool in threadpool_info() if pool["internal_api"] == "openblas"))
+"""
+    free = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, env=free)
+    assert set(done.stdout.split()) == {"1"}
+
+
 @pytest.mark.parametrize("command", ["track", "live"])
 def test_section_on_the_side_of_the_minus_sign_is_a_value(refused, tmp_path, command):
     """As documented, "--section -x=12"; argparse alone would take "-x=12" for an option."""

@@ -8,14 +8,14 @@ import threading
 import cv2
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from morph_dslam.errors import ArgumentError, SourceError
 from morph_dslam.sources import open_live, open_source, open_stream, register_source
 from morph_dslam.sources.frames import Frame
 from morph_dslam.sources.live import LiveCamera, Newest, PacedRecording
 from morph_dslam.sources.local_socket import FRAME_HEAD, MOST_BYTES, PICTURE_HEAD
-from morph_dslam.threads import ahead, one_thread_for_algebra, threads_side_by_side
+from morph_dslam.threads import ahead, one_openblas_thread, one_thread_for_algebra, threads_side_by_side
 
 
 class FakeCapture:
@@ -290,6 +290,17 @@ def test_linear_algebra_runs_in_one_thread_meanwhile_and_as_before_afterwards():
     assert meanwhile
     assert set(meanwhile) == {1}
     assert algebra_threads() == before
+
+
+def test_a_build_leaves_the_threads_of_openblas_as_they_were():
+    """Shared by threads, small matrices wait for a core that another program has."""
+    with threadpool_limits(limits=2, user_api="blas"):
+        with one_openblas_thread():
+            meanwhile = algebra_threads()
+        after = algebra_threads()
+    assert meanwhile
+    assert set(meanwhile) == {1}
+    assert set(after) == {2}
 
 
 def test_the_next_item_is_made_while_this_one_is_worked_on():

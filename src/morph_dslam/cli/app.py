@@ -29,6 +29,9 @@ INTERRUPTED = 130
 OUTPUT_CLOSED = 141
 #: How often a progress bar is written into a file or a pipe, seconds. tqdm reads the variable when it is loaded.
 LOGGED_EVERY = ("TQDM_MININTERVAL", "10")
+#: Threads of the linear algebra of numpy and scipy, which reads the variable when it is loaded, unless the user has set
+#: it: see `one_openblas_thread`.
+ALGEBRA_THREADS = ("OPENBLAS_NUM_THREADS", "1")
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -96,6 +99,7 @@ def run_and_report_errors(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status of `run_and_report_errors`."""
+    os.environ.setdefault(*ALGEBRA_THREADS)
     if not sys.stderr.isatty():
         os.environ.setdefault(*LOGGED_EVERY)
     given = sys.argv[1:] if arguments is None else arguments

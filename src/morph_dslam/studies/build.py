@@ -43,6 +43,7 @@ from morph_dslam.studies.study import Study, input_files, load_study, study_file
 from morph_dslam.studies.time_sampling import time_instants
 from morph_dslam.studies.unknown_loads import reduce_unknown_loads
 from morph_dslam.studies.weights import announced_mass
+from morph_dslam.threads import one_openblas_thread
 
 #: Fewer held-out solutions than these say nothing of the error.
 FEWEST_HELD_OUT = 4
@@ -121,7 +122,8 @@ def build(
     check_no_input([output], [study_file(study) if isinstance(study, str | Path) else None], StudyError)
     try:
         check_no_input([output], input_files(described), StudyError)
-        return _built(described, text, output, workers, executor)
+        with one_openblas_thread():
+            return _built(described, text, output, workers, executor)
     except StudyError as error:
         if isinstance(study, str | Path):
             raise StudyError(f"{study_file(study)}: {error}") from error

@@ -24,7 +24,7 @@ from typing import Any
 
 from morph_dslam.errors import WorkerError
 from morph_dslam.studies.sample_task import forget_problem
-from morph_dslam.threads import usable_cores
+from morph_dslam.threads import one_openblas_thread, usable_cores
 
 #: Of executors that do not say.
 DEFAULT_SLOTS = 16
@@ -113,6 +113,7 @@ def _start_worker(started: Any, laws: dict[str, Any]) -> None:
     for name in laws.keys() - registered_laws().keys():  # importing a law's module has registered it, as a rule
         register_law(name)(laws[name])
     started.value = 1
+    one_openblas_thread()
     warnings.simplefilter("ignore", NearlyIncompressibleWarning)  # said once, by the build
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
