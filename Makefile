@@ -18,6 +18,9 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 PIP_PROGRESS := awk '/^ *(Collecting|Downloading|Installing)/ { \
 	printf "\r\033[K  %.76s", $$1 " " $$2; fflush() } END { printf "\r\033[K" }'
 
+# What commands import. Python compiles the rest where it is used; all of it would take pip longer than its downloads.
+IMPORTED := numpy scipy numba llvmlite h5py cv2 matplotlib pydantic PIL meshio tqdm
+
 demo: $(INSTALLED)
 	@echo "make demo: builds a model, films it, tracks it; minutes the first time, later runs use what is there"
 	@$(BIN)/python examples/demo/run.py
@@ -90,5 +93,7 @@ $(INSTALLED): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer, with its venv module, is needed: no such python3 was found"; exit 1; }
 	@echo "Installing into $(VENV) with $(PYTHON) (a few minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev,docs,rerun]' | $(PIP_PROGRESS)
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --no-compile \
+		--editable '.[dev,docs,rerun]' | $(PIP_PROGRESS)
+	@cd $(VENV)/lib/python*/site-packages && $(CURDIR)/$(BIN)/python -m compileall -q -j 0 $(CURDIR)/src $(IMPORTED)
 	@touch $@
