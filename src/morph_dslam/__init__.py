@@ -9,7 +9,10 @@ who extend the program (material laws, sources, reduction methods, building bloc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from morph_dslam._compiled_code import find_folder
 from morph_dslam._version import __version__ as __version__
+
+find_folder()
 
 #: The module of each public name, as in the imports below; it is imported when the name is first used.
 _MODULES = {
