@@ -31,6 +31,17 @@ def test_coordinates_are_in_the_units_of_studies():
         assert set(choices) == set(FACTORS["length"])
 
 
+def test_an_option_that_a_command_does_not_have_is_answered_with_the_one_it_is_like(capsys):
+    for given, answer in (
+        ("build study.toml -o x --worker 2 --outlines", "--outlines; `morph build --help` lists the options"),
+        ("slam film.mp4 --camera c -o x --refine_camera", "--refine_camera (do you mean --refine-camera?)"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            cli.main(given.split())
+        assert end.value.code == 2
+        assert f"unrecognized arguments: {answer}" in capsys.readouterr().err
+
+
 def test_commands_multiply_matrices_in_one_thread(tmp_path):
     program = """
 from morph_dslam.cli import main

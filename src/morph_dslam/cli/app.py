@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 
 from morph_dslam._version import __version__
@@ -27,6 +29,8 @@ USER_ERROR = 2
 INTERRUPTED = 130
 #: Whoever read the output has stopped, `morph info sheet.morph | head` say: as a shell reports SIGPIPE.
 OUTPUT_CLOSED = 141
+#: From this likeness on (`difflib`) an option is taken for another one, misspelt.
+CLOSE = 0.8
 #: How often a progress bar is written into a file or a pipe, seconds. tqdm reads the variable when it is loaded.
 LOGGED_EVERY = ("TQDM_MININTERVAL", "10")
 #: Threads of the linear algebra of numpy and scipy, which reads the variable when it is loaded, unless the user has set
@@ -35,7 +39,7 @@ ALGEBRA_THREADS = ("OPENBLAS_NUM_THREADS", "1")
 
 
 def new_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; what it parses has `run`, the command, and `kept`; `main` adds `words`."""
+    """The parser of all commands; what it parses has `run`, `kept` and `command`; `main` adds `words`."""
     parser = argparse.ArgumentParser(
         prog="morph", description="Track a deformable solid in video with a physics-based reduced model."
     )
@@ -45,9 +49,18 @@ def new_parser() -> argparse.ArgumentParser:
         module = import_module(f"morph_dslam.cli.{name}")
         description = module.HELP[0].upper() + module.HELP[1:] + "."
         command = commands.add_parser(name, help=module.HELP, description=description)
-        command.set_defaults(run=module.run, kept=module.KEPT)
+        command.set_defaults(run=module.run, kept=module.KEPT, command=command)
         module.add_arguments(command)
     return parser
+
+
+def _not_understood(command: argparse.ArgumentParser, unknown: list[str]) -> str:
+    """Message on arguments that a command does not have; argparse's own shows the usage of `morph` alone."""
+    options = sorted(set(re.findall(r"--[a-z-]+", command.format_help())))
+    close = [name for word in unknown for name in get_close_matches(word.partition("=")[0], options, 1, CLOSE)]
+    meant = f" (do you mean {' and '.join(close)}?)" if close else ""
+    message = f"{command.prog}: error: unrecognized arguments: {' '.join(unknown)}{meant}"
+    return f"{message}; `{command.prog} --help` lists the options"
 
 
 def _output_is_closed() -> bool:
@@ -103,6 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not sys.stderr.isatty():
         os.environ.setdefault(*LOGGED_EVERY)
     given = sys.argv[1:] if arguments is None else arguments
-    parsed = new_parser().parse_args(with_signed_sections(given))
+    parser = new_parser()
+    parsed, unknown = parser.parse_known_args(with_signed_sections(given))
+    if unknown:
+        parser.exit(USER_ERROR, f"{_not_understood(parsed.command, unknown)}\n")
     parsed.words = list(given)
     return run_and_report_errors(parsed.run, parsed, parsed.kept)
