@@ -9,12 +9,12 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 import cv2
-from threadpoolctl import ThreadpoolController, threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,16 +23,25 @@ T = TypeVar("T")
 N_AHEAD = 2
 
 
+@cache
+def _algebra() -> ThreadpoolController:
+    """The libraries of numpy and scipy; to look for them takes milliseconds."""
+    import scipy.linalg  # noqa: F401 - it has a library of its own
+
+    return ThreadpoolController().select(user_api="blas")
+
+
 def one_thread_for_algebra(function: Callable[P, R]) -> Callable[P, R]:
     """Let linear algebra run in the thread that asks for it, as long as the decorated function does.
 
     A tracked frame multiplies many small matrices; threads that share one of them mostly wait for each other,
-    and take the cores from the threads that work on other frames, or from other programs.
+    and take the cores from the threads that work on other frames, or from other programs. Beside a program that has one
+    of two cores to itself, a frame took five times as long.
     """
 
     @wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _algebra().limit(limits=1):
             return function(*args, **kwargs)
 
     return alone

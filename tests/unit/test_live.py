@@ -4,6 +4,7 @@ import gc
 import socket
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -289,6 +290,9 @@ def test_linear_algebra_runs_in_one_thread_meanwhile_and_as_before_afterwards():
     assert total == 40.0**3
     assert meanwhile
     assert set(meanwhile) == {1}
+    assert algebra_threads() == before
+    with ThreadPoolExecutor(1) as other:  # of a program that tracks beside its own work
+        assert set(other.submit(product, size=4).result()[1]) == {1}
     assert algebra_threads() == before
 
 

@@ -30,6 +30,7 @@ from morph_dslam.identification.prior import KnownValues
 from morph_dslam.identification.scatter import Design, Noise, Scatter, directions, joint_labels, wider, without
 from morph_dslam.identification.values import FACTOR, Values
 from morph_dslam.model import Parameter, ReducedModel
+from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.flat_sides import FLAT_SHARE, LOOK, flat_variance
 from morph_dslam.tracking.observability import UNOBSERVABLE_SHARE
 
@@ -76,6 +77,7 @@ class _Spread:
         return np.sqrt(self.scatter.half**2 + float(norm.ppf(0.975)) ** 2 * np.diag(self.known + self.model + self.run))
 
 
+@one_thread_for_algebra
 def identify(
     model: ReducedModel,
     measurements: Sequence[Measurement],

@@ -46,6 +46,7 @@ from morph_dslam.registration.plausible_states import MeasuredPoints
 from morph_dslam.registration.registration import Registration
 from morph_dslam.registration.rig_check import cameras_contradict
 from morph_dslam.registration.starts import shape_starts
+from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.binding import DrawnSurface, nearest_surface_points
 from morph_dslam.tracking.compilation import announce_compilation
 from morph_dslam.tracking.depth import SCALE_STD, SIGMA_AT_1M
@@ -82,6 +83,7 @@ MOST_TURNED = 0.8
 SIZES = (0.005, 10.0)
 
 
+@one_thread_for_algebra
 def register_landmarks(
     model: ReducedModel,
     camera: Camera,

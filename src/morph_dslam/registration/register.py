@@ -58,6 +58,7 @@ from morph_dslam.render.overlay import draw_overlay
 from morph_dslam.render.shading import lambert, vertex_normals
 from morph_dslam.slam.rolling_shutter import middle_row_pixels, velocities
 from morph_dslam.slam.scene import Scene, load_scene
+from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.tracking.anchoring import points_on_object
 
 Array = NDArray[np.float64]
@@ -69,6 +70,7 @@ BOX_POINTS = 33
 N_PICTURES = 3
 
 
+@one_thread_for_algebra
 def register(
     scene: Scene,
     model: ReducedModel,

@@ -51,7 +51,7 @@ from morph_dslam.slam.tracking import similar_views
 from morph_dslam.sources import FrameSource, FrameStream, open_source, open_stream
 from morph_dslam.sources.frames import has_registered_depth
 from morph_dslam.sources.live import LiveStream
-from morph_dslam.threads import threads_side_by_side
+from morph_dslam.threads import one_thread_for_algebra, threads_side_by_side
 from morph_dslam.tracking.patches import patch_correlation
 
 Array = NDArray[np.float64]
@@ -216,6 +216,7 @@ def load_scene(path: str | Path, camera: Camera) -> Scene:
     return Scene(camera, *load_map_and_trajectory(Path(path), camera), path=Path(path))
 
 
+@one_thread_for_algebra
 def map_scene(
     source: FrameStream | str | Path,
     camera: Camera | StereoCamera,

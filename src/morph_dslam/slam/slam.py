@@ -29,6 +29,7 @@ from morph_dslam.slam.relocalization import Relocalizer
 from morph_dslam.slam.result import STAGES, NoPose, SlamFrame, SlamReason, SlamStatus
 from morph_dslam.slam.rigid_map import CANDIDATE, NOWHERE, Followed, RigidMap
 from morph_dslam.slam.tracking import Tracked, Tracker
+from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.timing import WaitClock, frame_clock, stage
 
 Array = NDArray[np.float64]
@@ -146,6 +147,7 @@ class Slam:
         if self.is_frozen:
             self._tracker.choose_views()
 
+    @one_thread_for_algebra
     def process_frame(
         self,
         image: NDArray[np.uint8],

@@ -16,6 +16,7 @@ from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.sources import Frame
 from morph_dslam.sources.frames import MissingFrame
+from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import FIRST_SIGMA_PX, HELD, LEAST_SIGMA_PX, Anchor, CameraLocalization
 from morph_dslam.tracking.depth_scale import CommonDepthScale
@@ -163,10 +164,12 @@ class RigTracker:
         """Take in what something else measures of parameters, in the next frames; see `Tracker.know`."""
         self.estimator.known.tell(values)
 
+    @one_thread_for_algebra
     def locate(self, frame: Frame) -> CameraLocalization:
         """Find the first camera in the map by its frame; see `Tracker.locate`."""
         return self.trackers[0].locate(frame)
 
+    @one_thread_for_algebra
     def track(
         self,
         frames: Sequence[Frame | NDArray[np.uint8] | None],

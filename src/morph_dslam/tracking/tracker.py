@@ -20,6 +20,7 @@ from morph_dslam.model.model_errors import ModelErrors
 from morph_dslam.registration.registration import PosePrior, Registration
 from morph_dslam.slam.self_calibration import OffByFactors
 from morph_dslam.sources import Frame
+from morph_dslam.threads import one_thread_for_algebra
 from morph_dslam.timing import frame_clock, stage
 from morph_dslam.tracking.anchoring import Anchor, Anchoring, CameraLocalization
 from morph_dslam.tracking.compilation import announce_compilation
@@ -170,6 +171,7 @@ class Tracker:
         if reference is not None:
             self._begin(reference)
 
+    @one_thread_for_algebra
     def track(
         self,
         frame: Frame | NDArray[np.uint8],
@@ -239,6 +241,7 @@ class Tracker:
         """
         self.estimator.known.tell(values)
 
+    @one_thread_for_algebra
     def locate(self, frame: Frame | NDArray[np.uint8]) -> CameraLocalization:
         """Find the camera of the next frame in the map, and with it the object's pose there.
 
