@@ -12,6 +12,7 @@ from morph_dslam import load_study
 from morph_dslam.meshing.generators import block
 from morph_dslam.model import load_model
 from morph_dslam.studies.build import build
+from morph_dslam.studies.external_doubts import doubts
 
 MESH = block((0.06, 0.03, 0.02), (3, 2, 2), "hex8")
 POINTS, CELLS = 1e3 * MESH.nodes, MESH.blocks[0].connectivity
@@ -273,6 +274,15 @@ def test_a_parameter_without_an_effect_is_named(tmp_path):
     few = np.column_stack([np.tile([-1.0, -0.4, 0.1, 0.6, 1.0], 4), np.repeat([-1.0, -0.2, 0.4, 1.0], 5)])
     curved = write(tmp_path / "c", few, lambda _, a, b: {"U": (0.1 * np.sin(3.0 * a) + 0.005 * b) * POINTS})
     assert not [text for text in made(curved)[1] if "no effect" in text]
+
+
+def test_neither_of_two_proportional_columns_is_without_an_effect():
+    """Either column alone gives the displacement exactly; without both of them nothing would."""
+    pull = np.linspace(-1.0, 1.0, 20)
+    moved_by = (1.0 + pull)[:, None] * np.random.default_rng(1).normal(size=30)
+    states = np.column_stack([pull, 2.0 * pull])
+    found = doubts(states, ["pull", "shear"], {"displacement": moved_by @ moved_by.T}, [""] * len(pull))
+    assert not [text for text in found if "no effect" in text]
 
 
 def test_defaults_are_those_of_the_study(tmp_path):

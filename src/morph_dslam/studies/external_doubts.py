@@ -205,10 +205,13 @@ def _has_effect(samples: Array, gram: Array, k: int) -> bool:
         fit = _fit(columns, gram, every, indices)
         return np.inf if fit is None else fit.error
 
+    own = error(every)
+    # Columns that are proportional have one effect together: nobody can tell whose it is.
+    if not np.isfinite(own):
+        return True
     if least <= ROUNDING * usual:
         return False
-    own, others = error(every), [error(rng.permutation(len(samples))) for _ in range(_ORDERS)]
-    return own < min(others) or not np.isfinite(own)
+    return own < min(error(rng.permutation(len(samples))) for _ in range(_ORDERS))
 
 
 def empty_share(samples: Array) -> float:
@@ -246,7 +249,7 @@ def doubts(samples: Array, names: Sequence[str], grams: dict[str, Array], places
     found = [sentence for _, sentence in sorted(sentences.items())]
     found += [
         f"parameter '{names[k]}' has no effect that the solutions show: those left out are predicted as well without "
-        "it; leave its column out, as it costs accuracy and images cannot show it"
+        "it; leave its column out, as it costs accuracy, or solve more states if its effect is small beside the others'"
         for k in without_effect(2.0 * filling - 1.0, list(grams.values()))
     ]
     share = empty_share(filling) if samples.shape[1] > 1 else 0.0
