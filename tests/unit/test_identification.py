@@ -155,10 +155,15 @@ def test_what_a_result_rests_on_is_said() -> None:
     model, places = stating(stated), np.linspace(0.0, 1.0, 9)
     forces = MeasuredForces(model, ForceCurve("a", places, 70.0 * places), reaction_in_direction(model, "edge:z"))
     found = identify(model, [forces], moduli=True)
-    # Both errors are factors of the force, as the one to identify.
-    assert found[FACTOR].model_std == pytest.approx(0.7 * 0.04, rel=1e-6)
-    assert found[FACTOR].std == pytest.approx(0.7 * 0.04, rel=1e-6)
-    assert found[FACTOR].interval == pytest.approx((0.7 * np.exp(-1.96 * 0.04), 0.7 * np.exp(1.96 * 0.04)), rel=1e-4)
+    # Both errors are factors of the force, as the one to identify; that of the reduction has another sign in each of
+    # eight parts too, of which the first has two places. A line's slope is sum((x - mean) y) / sum((x - mean)^2).
+    slope = (places - 0.5) * places / np.sum((places - 0.5) ** 2)
+    waves = 0.01 * np.r_[slope[0] + slope[1], slope[2:]]
+    expected = np.hypot(0.04, np.linalg.norm(waves))
+    assert found[FACTOR].model_std == pytest.approx(0.7 * expected, rel=1e-6)
+    assert found[FACTOR].std == pytest.approx(0.7 * expected, rel=1e-6)
+    ends = 0.7 * np.exp(np.array([-1.96, 1.96]) * expected)
+    assert found[FACTOR].interval == pytest.approx(tuple(ends), rel=1e-4)
     text = "\n".join(identification_lines(summarise(found)))
     assert f"defaults for force: b = 0.5, c = 0.5; {FACTOR} multiplies the moduli there" in text
     assert f"most of the interval of {FACTOR} is the model's own error" in text
@@ -297,7 +302,7 @@ def test_what_is_measured_of_one_parameter_tells_of_another_that_is_correlated_w
     prior = KnownValues(("a", "b"), np.array([0.31, 0.6]), covariance)
     found = identify(table.model, [table], ["b", "a"], prior=prior)
     gain = covariance[0, 1] / (covariance[0, 0] + alone.std**2)
-    assert found["b"].value - 0.6 == pytest.approx(gain * (alone.value - 0.31), rel=0.05)
+    assert found["b"].value - 0.6 == pytest.approx(gain * (alone.value - 0.31), rel=0.1)
     assert found["b"].std == pytest.approx(np.sqrt(covariance[1, 1] - gain * covariance[0, 1]), rel=0.02)
 
 

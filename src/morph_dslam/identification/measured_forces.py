@@ -16,7 +16,7 @@ from morph_dslam.identification.common_errors import state_errors
 from morph_dslam.identification.values import Values
 from morph_dslam.model import Parameter, ReducedModel
 from morph_dslam.model.separated import Outside
-from morph_dslam.model.stated_errors import force_error
+from morph_dslam.model.stated_errors import force_error, reduction_force_error
 from morph_dslam.units import smaller_units
 
 Array = NDArray[np.float64]
@@ -197,9 +197,12 @@ class MeasuredForces:
         if stated is None:
             return np.zeros((0, len(self.values)))
         forces = self._forces(unknowns)
-        # Like a factor of all forces, and of the whole force where that along an axis is a small part.
+        # Of the whole force, where that along an axis is a small part.
         sizes = np.linalg.norm(forces, axis=1) * np.sign(self.compared.sign * forces[:, self.compared.axis])
-        return stated[0] * sizes[None]
+        # Like a factor of all forces; functions that were fitted also err as a wave along the curve.
+        groups = self.groups
+        by_reduction = reduction_force_error(self.model, self.reaction.support) * sizes
+        return np.array([stated[0] * sizes, *(np.where(groups == k, by_reduction, 0.0) for k in np.unique(groups))])
 
     def state_errors(self, unknowns: Values) -> Array:
         run = self.run

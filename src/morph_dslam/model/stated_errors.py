@@ -94,6 +94,11 @@ def force_error(model: ReducedModel, support: str) -> tuple[float, bool] | None:
     return reduction + (discretisation or 0.0), discretisation is not None
 
 
+def reduction_force_error(model: ReducedModel, support: str) -> float:
+    """Relative error of the force on a support by the reduction alone; 0 if none is stated."""
+    return model.certificate.get(f"{REACTION}{FORCE}{support}", {}).get("relative_l2") or 0.0
+
+
 def largest_force_error(model: ReducedModel, support: str) -> float:
     """Error of the force on a support where that is largest, newtons; 0 if none is stated."""
     stated = force_error(model, support)
