@@ -9,8 +9,8 @@ who extend the program (material laws, sources, reduction methods, building bloc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from morph_dslam._compiled_code import find_folder
 from morph_dslam._version import __version__ as __version__
+from morph_dslam.compiled_code import find_folder
 
 find_folder()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from morph_dslam._compiled_code import own_folder
+from morph_dslam.compiled_code import own_folder
 
 #: Where nothing can be made.
 NOWHERE = {"XDG_CACHE_HOME": "/proc/nowhere"}
