@@ -201,7 +201,7 @@ class MeasuredForces:
         sizes = np.linalg.norm(forces, axis=1) * np.sign(self.compared.sign * forces[:, self.compared.axis])
         # Like a factor of all forces; functions that were fitted also err as a wave along the curve.
         groups = self.groups
-        by_reduction = reduction_force_error(self.model, self.reaction.support) * sizes
+        by_reduction = (reduction_force_error(self.model, self.reaction.support) or 0.0) * sizes
         return np.array([stated[0] * sizes, *(np.where(groups == k, by_reduction, 0.0) for k in np.unique(groups))])
 
     def state_errors(self, unknowns: Values) -> Array:

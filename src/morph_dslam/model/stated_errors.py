@@ -84,19 +84,19 @@ def unknown_mesh_error(model: ReducedModel) -> str | None:
     return stated.get(NOT_ESTIMATED) if model.study_parameters and stated.get(ESTIMABLE, False) else None
 
 
+def reduction_force_error(model: ReducedModel, support: str) -> float | None:
+    """Relative error of the force on a support by the reduction alone; None if none is stated."""
+    return model.certificate.get(f"{REACTION}{FORCE}{support}", {}).get("relative_l2")
+
+
 def force_error(model: ReducedModel, support: str) -> tuple[float, bool] | None:
     """Relative error of the force on a support, and whether the discretisation's is in it; None if none is stated."""
     name = f"{REACTION}{FORCE}{support}"
-    reduction = model.certificate.get(name, {}).get("relative_l2")
+    reduction = reduction_force_error(model, support)
     if reduction is None:
         return None
     discretisation = model.certificate.get("discretisation", {}).get("errors", {}).get(name, {}).get("relative_l2")
     return reduction + (discretisation or 0.0), discretisation is not None
-
-
-def reduction_force_error(model: ReducedModel, support: str) -> float:
-    """Relative error of the force on a support by the reduction alone; 0 if none is stated."""
-    return model.certificate.get(f"{REACTION}{FORCE}{support}", {}).get("relative_l2") or 0.0
 
 
 def largest_force_error(model: ReducedModel, support: str) -> float:

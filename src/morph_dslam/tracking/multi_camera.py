@@ -164,7 +164,6 @@ class RigTracker:
         """Take in what something else measures of parameters, in the next frames; see `Tracker.know`."""
         self.estimator.known.tell(values)
 
-    @one_thread_for_algebra
     def locate(self, frame: Frame) -> CameraLocalization:
         """Find the first camera in the map by its frame; see `Tracker.locate`."""
         return self.trackers[0].locate(frame)
