@@ -168,6 +168,16 @@ def test_no_factor_is_found_where_a_load_keeps_its_size(study: str, load: str) -
         factor_of(curve_of(bar(study), by_stroke, free_zero=False))
 
 
+@pytest.mark.parametrize("study", [BODY + WEIGHT, BODY + STROKE + WEIGHT])
+def test_points_of_a_body_under_its_weight_alone_are_refused_with_the_weight_as_the_reason(study: str) -> None:
+    """They do depend on the moduli: a body twice as stiff sags half as far."""
+    table = MeasuredPoints(bar(study), ("hangs",) * 4, {}, CORNERS, CORNERS + np.array([0.5 / TRUTH, 0.0, 0.0]))
+    with pytest.raises(
+        IdentificationError, match=r"^load 1 \(gravity\) of the study .* found\. Make a modulus a param"
+    ):
+        identify(table.model, [table], moduli=True)
+
+
 def test_a_free_zero_takes_up_what_is_the_same_in_all_states() -> None:
     table = curve_of(bar(BODY + STROKE + WEIGHT), lambda p: by_stroke(p) + 3.0, most=1.0)
     found = identify(table.model, [table], moduli=True)

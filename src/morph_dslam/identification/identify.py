@@ -138,14 +138,18 @@ def _loads(model: ReducedModel, measurements: Sequence[Measurement], parameters:
     from morph_dslam.identification.given_loads import GivenLoads
 
     loads = GivenLoads.of(model)
+    # Points alone show the factor by the loads that it divides.
+    is_unseen = not loads.scaled and not any(isinstance(each, MeasuredForces) for each in measurements)
     for measurement in measurements:
         varied = measurement.given | set(parameters)
         # The free zero of a load cell takes up what stays the same.
-        is_absolute = isinstance(measurement, MeasuredForces) and not measurement.free_zero
+        is_force = isinstance(measurement, MeasuredForces)
+        is_absolute = not measurement.free_zero if isinstance(measurement, MeasuredForces) else is_unseen
         for load in loads.unscaled:
             steady = load.is_steady and not load.parameters & varied
             if is_absolute or not steady:
-                advice = "Leave the zero of the load cell free (no --no-offset), or make" if steady else "Make"
+                free = "Leave the zero of the load cell free (no --no-offset), or make"
+                advice = free if steady and is_force else "Make"
                 raise IdentificationError(
                     f"{load.name} of the study does not grow with the moduli, and {measurement.name} depends on it: "
                     f"one factor of all moduli cannot be found. {advice} a modulus a parameter of the study, and "
