@@ -31,6 +31,8 @@ def refusal(folder: Path, text: str, column: str | None = None) -> str:
     [
         ("force_N", 1.0),
         ("force_mN", 1e-3),
+        ("force (kN)", 1e3),
+        ("load(lbf)", 0.45359237 * 9.80665),
         ("force_kN", 1e3),
         ("force_MN", 1e6),
         ("force_g", 9.80665e-3),
@@ -55,6 +57,8 @@ def test_a_column_of_forces_ends_in_its_unit(tmp_path: Path, column: str, newton
         "force_right",
         "notch_3.6mm",
         "specimen_A",
+        "force (run 2)",
+        "force N",
         "specimen_V",
         "specimen_s",
         "force_1",
@@ -73,6 +77,18 @@ def test_what_seems_a_unit_but_is_none_of_force_is_refused(tmp_path: Path, unit:
         f"curve.csv: column 'force_{unit}' ends in '{unit}', which is no unit of force that is known: give one of "
         "N, mN, kN, uN, MN, gf, g, kgf, kg, lbf, lb, ozf, oz"
     )
+
+
+@pytest.mark.parametrize("title", ["force kN", "force/kN", "force / kN"])
+def test_a_unit_that_only_a_space_sets_apart_is_not_left_out(tmp_path: Path, title: str) -> None:
+    said = refusal(tmp_path, f"arch_mm,{title}\n0,1\n1,2\n2,4\n")
+    assert said == f"curve.csv: the unit of column '{title}' is not set apart: write force_kN"
+
+
+@pytest.mark.parametrize("asked", [None, "force_N"])
+def test_of_two_columns_of_one_name_none_is_taken(tmp_path: Path, asked: str | None) -> None:
+    said = refusal(tmp_path, "arch_mm,force_N,force_N\n0,1,2\n1,2,4\n2,4,8\n", asked)
+    assert said == "curve.csv has several columns 'force_N': give each a name of its own"
 
 
 def test_only_the_unit_of_the_column_that_is_read_counts(tmp_path: Path) -> None:

@@ -370,6 +370,7 @@ def test_bounds_that_hold_no_solution_are_refused():
         ("strain,stress [kPa]", "0.5,600", "1,900"),
         ("strain [%],true_stress_N/mm2", "50,0.9", "100,1.8"),
         ("time_min,Strain_percent,Stress_MPa,note", "0,50,0.6,a", "1,100,0.9,b"),
+        ("Time (min),strain (%),stress (MPa)", "0,50,0.6", "1,100,0.9"),
         ("stress_MPa,stretch", "0.6,1.5", "0.9,2.0"),
         ("time_stamp,TIME_MIN,stretch,stress_MPa", "12:00,0,1.5,0.6", "12:01,1,2.0,0.9"),
         ("time_stamp,stretch,stress_MPa,time", "12:00,1.5,0.6,", "12:01,2.0,0.9,"),
@@ -382,7 +383,7 @@ def test_columns_are_read_in_their_units(tmp_path, titles, first, second):
     np.testing.assert_allclose(read.stretch, [1.5, 2.0])
     np.testing.assert_allclose(read.stress, [0.6e6, 0.9e6])
     assert read.kind == "planar"
-    if "time_min" in titles.lower():
+    if any(title in titles.lower() for title in ("time_min", "time (min)")):
         np.testing.assert_allclose(read.time, [0.0, 60.0])
     else:
         assert read.time is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +58,7 @@ class ForceCurve:
 
 def load_curve(path: str | Path, model: ReducedModel, column: str | None = None, least: int = LEAST) -> ForceCurve:
     """Read a curve: CSV whose first column is ``frame``, or a parameter with its unit, ``stroke_mm`` or
-    ``stroke [mm]`` say.
+    ``stroke [mm]`` or ``stroke (mm)`` say.
 
     The other columns are forces with their unit, ``force_N`` say, in newtons where they name none.
 
@@ -104,6 +105,8 @@ def _column(path: str | Path, titles: Sequence[str], asked: str | None) -> str:
         raise EvaluationError(
             f"{path} has no column of forces: give one beside '{titles[0]}', with its unit, as {titles[0]},force_N"
         )
+    if columns.count(asked or columns[0]) > 1:
+        raise EvaluationError(f"{path} has several columns '{asked or columns[0]}': give each a name of its own")
     if asked is None and len(columns) == 1:
         return columns[0]
     if asked in columns:
@@ -121,6 +124,10 @@ def _newtons(path: str | Path, column: str) -> float:
             f"{path}: column '{column}' ends in '{unit}', which is no unit of force that is known: give one of "
             f"{', '.join(FORCE_UNITS)}"
         )
+    end = re.split(r"[\s/]", unit)[-1]
+    if end != unit and len(end) > 1 and end in FORCE_UNITS:
+        name = column.removesuffix(end).rstrip(" /")
+        raise EvaluationError(f"{path}: the unit of column '{column}' is not set apart: write {name}_{end}")
     return newtons_of(column)
 
 

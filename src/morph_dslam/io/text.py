@@ -11,7 +11,7 @@ from typing import Any
 
 from morph_dslam.errors import MorphError
 
-_BRACKETED = re.compile(r"(.*\S)\s*\[(.+)\]")
+_BRACKETED = re.compile(r"(.*\S)\s*(?:\[(.+)\]|\((.+)\))")
 #: A name that becomes a part of columns, and a group in a file.
 PLAIN_NAME = re.compile(r"\w[\w -]*")
 PLAIN_NAME_RULE = "give one of letters, digits, spaces, - and _"
@@ -66,9 +66,9 @@ def has_a_cell_for_each(titles: Sequence[str], cells: Sequence[str]) -> bool:
 
 
 def name_and_unit(header: str) -> tuple[str, str]:
-    """Both parts of a column's header, "stroke_mm" or "stroke [mm]"."""
+    """Both parts of a column's header, "stroke_mm", "stroke [mm]" or "stroke (mm)"."""
     if bracketed := _BRACKETED.fullmatch(header):
-        return bracketed[1], bracketed[2]
+        return bracketed[1], bracketed[2] or bracketed[3]
     name, _, unit = header.rpartition("_")
     return name, unit
 

@@ -16,7 +16,11 @@ from morph_dslam.units import FACTORS
 Array = NDArray[np.float64]
 #: No rubber stands a larger stretch: percent were meant.
 _LARGEST = 30.0
-_STRAINS = {"stretch": (0.0, 1.0), "strain": (1.0, 1.0), "strain [%]": (1.0, 0.01), "strain_percent": (1.0, 0.01)}
+_PERCENT = (1.0, 0.01)
+_STRAINS = {
+    **{"stretch": (0.0, 1.0), "strain": (1.0, 1.0)},
+    **dict.fromkeys(("strain [%]", "strain (%)", "strain_percent"), _PERCENT),
+}
 _EXAMPLE = "stretch,stress_MPa"
 
 
