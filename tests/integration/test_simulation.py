@@ -4,9 +4,11 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import trimesh
 
 import morph_dslam as md
 from morph_dslam.cli.app import main
+from morph_dslam.extend.studies import build_rigid
 from morph_dslam.io.camera_files import load_camera
 from morph_dslam.io.trajectory import load_trajectory
 from morph_dslam.model import load_model
@@ -96,6 +98,30 @@ def test_depth_images_hold_the_visible_truth_points(moving, truth):
         gap = depth[frame, rows, columns] - truth["points_mm"][frame][seen][:, 2] * 1e-3
         # Half a pixel sideways on a slope changes the depth by a millimetre or so.
         assert np.abs(gap).max() < 2.5e-3
+
+
+def test_points_on_the_far_sides_of_a_thin_block_are_hidden(tmp_path):
+    """Of a convex body a point is to be seen where its side is turned to the camera."""
+    sides = np.array([40.0, 10.0, 5.0])
+    block = trimesh.creation.box(extents=sides).subdivide_to_size(4.0)
+    block.export(tmp_path / "block.stl")
+    build_rigid(tmp_path / "block.stl", "mm", tmp_path / "block.morph")
+    scene = tmp_path / "scene.toml"
+    pose = "[[pose]]\nframe = 0\nposition_mm = [0, 0, 80]\nrotation_deg = [35, 20, 0]\n"
+    surface = "[surface]\ntexture = 'gravel'\n"
+    scene.write_text(f"model = 'block.morph'\nframes = 1\n{CAMERA}{surface}{pose}")
+    simulate(scene, tmp_path / "sequence", progress=False)
+    truth = np.load(tmp_path / "sequence" / "truth.npz")
+    matrix = truth["camera_from_object"][0]
+    seen_from = -matrix[:3, :3].T @ matrix[:3, 3]
+    points = (truth["points_mm"][0] / 1e3 - matrix[:3, 3]) @ matrix[:3, :3]
+    side = (np.abs(points) / sides).argmax(axis=1)
+    rows = np.arange(len(points))
+    outwards = np.sign(points[rows, side])
+    faces_camera = outwards * (seen_from - points)[rows, side] > 0.0
+    on_an_edge = np.sort(np.abs(points) / (sides / 2e3), axis=1)[:, 1] > 1.0 - 1e-6
+    np.testing.assert_array_equal(truth["visible"][0][~on_an_edge], faces_camera[~on_an_edge])
+    assert 60 < faces_camera[~on_an_edge].sum() < 0.7 * len(points)
 
 
 def test_occluder_hides_what_it_covers(moving, truth):

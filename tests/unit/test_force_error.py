@@ -124,7 +124,7 @@ def test_support_and_direction_may_be_named(asked, factor, direction):
         ),
         (np.arange(10.0), "clamp:+x", "in direction x falls where .* write --reaction clamp:-x"),
         (np.arange(10.0), "clamp:-y", "in direction -y falls where .* write --reaction clamp:\\+y"),
-        (np.arange(10.0) + 8, None, "only 2 tracked frames lie on the curve"),
+        (np.arange(10.0) + 8, None, "2 of the tracked frames lie on the curve"),
         (np.arange(10.0) % 5, None, "more than once"),
     ],
 )

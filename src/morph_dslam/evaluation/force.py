@@ -181,7 +181,7 @@ def force_error(run: Run, curve: ForceCurve, reaction: str | None = None) -> For
     kept = np.isfinite(measured)
     if kept.sum() < LEAST:
         raise EvaluationError(
-            f"only {int(kept.sum())} tracked frames lie on the curve, and at least {LEAST} are needed: it covers "
+            f"{int(kept.sum())} of the tracked frames lie on the curve, and at least {LEAST} must: it covers "
             f"{_range(run, curve.against, curve.places)}, the run {_range(run, curve.against, places)}"
         )
     _check_spanned(run, curve, places[kept])

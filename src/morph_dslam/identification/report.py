@@ -159,7 +159,7 @@ def identification_lines(figures: Mapping[str, Any]) -> list[str]:
                 )
     if measured and figures["groups"] < 3 * len(names):
         said.append(
-            f"note: only {figures['groups']} groups of measurements whose errors are independent of each other: "
+            f"note: few groups of measurements whose errors are independent of each other ({figures['groups']}): "
             "intervals are rough"
         )
     said += _curves_differ(figures)

@@ -29,6 +29,7 @@ from morph_dslam.io.writing import check_no_input, writing
 from morph_dslam.model import ReducedModel, SurfacePoints, load_model
 from morph_dslam.model.reduced_model import spread_over
 from morph_dslam.render.environment import VALUES_PER_METRE, Motion, StaticScene, plan_motion, sensor_depth
+from morph_dslam.render.picking import pick_surface
 from morph_dslam.render.rasteriser import rasterise, visible_points
 from morph_dslam.render.scene_file import Scene, interpolate_key_frames, load_scene_file
 from morph_dslam.render.scene_renderer import Instant, SceneRenderer, band_seconds, in_disc, pixel_axes, supersampled
@@ -39,8 +40,10 @@ Array = NDArray[np.float64]
 N_TRUTH_POINTS = 300
 #: Landmarks of an object that deforms, and of a rigid one.
 MIN_LANDMARKS, MIN_LANDMARKS_RIGID = 8, 4
-#: A point so far behind the depth buffer is hidden; less may be the surface's own slope within a pixel.
+#: A point so far behind the surroundings, metres, is hidden; less may be their own slope within a pixel.
 HIDDEN_BY = 3e-3
+#: By this part of its depth a point may seem to be behind itself.
+ROUNDING = 1e-9
 #: The file by which a simulation is known, and one that was not finished; what else it writes beside frames.
 _TRUTH, _UNFINISHED = "truth.npz", "truth.npz.partial"
 _WRITTEN = ("camera.yaml", "landmarks.csv", "depth.h5", "rgb.txt", "depth.txt", "groundtruth.txt")
@@ -92,13 +95,26 @@ class _World:
             return np.zeros(np.broadcast_shapes(columns.shape, rows.shape), dtype=bool)
         return in_disc(columns, rows, centres[frame], occluder.radius_px)
 
-    def visible(self, frame: int, points: Array, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which surface points (p, 3), camera frame, are in the image with nothing in front of them.
+    def visible(self, frame: int, points: Array, nodes: Array, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which surface points are in the image with nothing in front of them.
 
-        ``depth`` (h, w) is that of the object and its surroundings.
+        What the object hides of itself is found by the points' rays, exactly; a depth image has no place between
+        pixels, and thin objects have two faces nearer to each other than its steps on a slope.
+
+        Parameters
+        ----------
+        frame : its number.
+        points : (p, 3) in the camera frame, metres.
+        nodes : (n, 3) of the model's mesh there.
+        behind : (h, w) depth of the surroundings.
         """
-        pixels = self.camera.project(points)
-        seen = visible_points(pixels, points[:, 2], depth, HIDDEN_BY)
+        pixels, depths = self.camera.project(points), points[:, 2]
+        seen = visible_points(pixels, depths, behind, HIDDEN_BY)
+        first, nearest = pick_surface(nodes, self.model.triangles, points), np.full(len(points), np.inf)
+        met = first.triangles >= 0
+        corners = nodes[self.model.triangles[first.triangles[met]], 2]
+        nearest[met] = np.einsum("pc,pc->p", first.weights[met], corners)
+        seen &= depths <= nearest * (1.0 + ROUNDING)
         return seen & ~self.occluded(frame, *self.camera.project_recorded(points).T)
 
     def renderer(self) -> SceneRenderer:
@@ -222,8 +238,7 @@ def _landmarks(world: _World) -> Landmarks:
     """Landmarks that frame 0 shows: mesh nodes and their pixels."""
     nodes = landmark_nodes(world.model) if is_sheet(world.model) else spread_nodes(world.model)
     positions = world.node_positions(0)
-    depth = np.minimum(world.depth_image(positions), world.surroundings_depth(0))
-    nodes = nodes[world.visible(0, positions[nodes], depth)]
+    nodes = nodes[world.visible(0, positions[nodes], positions, world.surroundings_depth(0))]
     least = MIN_LANDMARKS if world.model.parameters else MIN_LANDMARKS_RIGID
     if len(nodes) < least:
         raise SceneError(
@@ -303,7 +318,7 @@ def _render_frames(
             _write_image(path, world.image(frame, renderer), jpg if path.suffix == ".jpg" else png)
             depth, behind = world.depth_image(nodes), world.surroundings_depth(frame)
             both, occluded = np.minimum(depth, behind), world.occluded(frame, columns, rows)
-            visible[frame] = world.visible(frame, truth[frame], both)
+            visible[frame] = world.visible(frame, truth[frame], nodes, behind)
             hidden = np.isinf(depth) | (behind < depth) | occluded
             depths[frame] = np.where(hidden, np.float32(0.0), depth)
             measured = world.measured_depth(frame, both, occluded)
