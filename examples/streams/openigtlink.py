@@ -55,7 +55,11 @@ def crc64(data: bytes) -> int:
 
 
 def packed(kind: str, device: str, body: bytes, seconds: float) -> bytes:
-    """A message of version 1 with its header; a device's name has `MOST_BYTES` at most."""
+    """A message of version 1 with its header; a device's name has `MOST_BYTES` at most.
+
+    A time that the header cannot hold is sent as 0: before 0, or not below 2**32 s, as in nanoseconds since 1970.
+    """
+    seconds = seconds if 0.0 <= seconds < 2**32 else 0.0
     whole = int(seconds)
     fraction = int((seconds - whole) * 2**32)
     name = device.encode()

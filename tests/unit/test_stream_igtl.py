@@ -49,6 +49,16 @@ def test_messages_are_byte_for_byte_those_of_another_library():
     assert sample.packed("POLYDATA", "seal", sample.polydata_body(POINTS, TRIANGLES), seconds) == surface
 
 
+@pytest.mark.parametrize(
+    ("seconds", "sent"), [(-0.5, 0.0), (1.7e18, 0.0), (2.0**32, 0.0), (2.0**32 - 0.5, 2.0**32 - 0.5)]
+)
+def test_a_time_that_the_header_cannot_hold_is_sent_as_zero(seconds, sent):
+    """As of frames whose times are nanoseconds since 1970, or before the zero of a recording's clock."""
+    body = sample.transform_body(POSE.matrix)
+    expected = igtl.TransformMessage(POSE.matrix, timestamp=sent, device_name="seal_pose").pack()
+    assert sample.packed("TRANSFORM", "seal_pose", body, seconds) == expected
+
+
 def test_no_two_devices_have_one_name_nor_one_that_is_too_long():
     """A client would take them for one. 3D Slicer's are known by their names alone, of 20 bytes."""
     fingers = ["pneumatic_finger_left", "pneumatic_finger_right", "leber_gr\u00f6\u00dfe_links_x"]
