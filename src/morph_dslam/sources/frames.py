@@ -20,6 +20,8 @@ from morph_dslam.io.file_kinds import IMAGES, content_kind, file_kind, named_kin
 
 #: Frames per second where a recording does not tell it.
 ASSUMED_FPS = 30.0
+#: No time in seconds is later, nor a negative one earlier: nanoseconds or milliseconds since 1970 are.
+LATEST_S = 9e9
 #: The bytes with which a complete picture of this kind ends; the decoder itself fills what is missing with grey.
 _END_MARKERS = {".png": b"IEND", ".jpg": b"\xff\xd9"}
 
@@ -103,12 +105,14 @@ def check_frame(frame: object, before: Frame | None, source: str) -> None:
 
 
 def check_time(frame: Frame, what: str) -> None:
-    """Raise SourceError unless a frame's time is a number; the message begins with ``what``."""
+    """Raise SourceError unless a frame's time is a number of seconds; the message begins with ``what``."""
     time: object = frame.timestamp
     if time is None:
         raise SourceError(f"{what} has no timestamp: give its time in seconds")
     if not isinstance(time, Real) or not np.isfinite(float(time)):
         raise SourceError(f"{what} has the timestamp {time!r}: give its time in seconds, as a finite number")
+    if abs(float(time)) > LATEST_S:
+        raise SourceError(f"{what} has the timestamp {time!r}, which is no time in seconds: convert it to seconds")
 
 
 class CheckedStream:

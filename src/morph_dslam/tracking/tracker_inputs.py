@@ -158,7 +158,7 @@ class Picture:
         CameraError
             If the image is not one of the camera's, or the depth, if it is to be used, is not one that belongs to it.
         SourceError
-            If a frame's time is no number.
+            If a frame's time is no number of seconds.
         """
         if not isinstance(frame, Frame):
             return cls(camera.checked_picture(frame, "the frame"))
