@@ -144,7 +144,7 @@ def _loads(model: ReducedModel, measurements: Sequence[Measurement], parameters:
         varied = measurement.given | set(parameters)
         # The free zero of a load cell takes up what stays the same.
         is_force = isinstance(measurement, MeasuredForces)
-        is_absolute = not measurement.free_zero if isinstance(measurement, MeasuredForces) else is_unseen
+        is_absolute = not measurement.free_zero if is_force else is_unseen
         for load in loads.unscaled:
             steady = load.is_steady and not load.parameters & varied
             if is_absolute or not steady:

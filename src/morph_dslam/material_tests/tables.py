@@ -16,11 +16,8 @@ from morph_dslam.units import FACTORS
 Array = NDArray[np.float64]
 #: No rubber stands a larger stretch: percent were meant.
 _LARGEST = 30.0
-_PERCENT = (1.0, 0.01)
-_STRAINS = {
-    **{"stretch": (0.0, 1.0), "strain": (1.0, 1.0)},
-    **dict.fromkeys(("strain [%]", "strain (%)", "strain_percent"), _PERCENT),
-}
+_STRAINS = {"stretch": (0.0, 1.0), "strain": (1.0, 1.0)}
+_STRAINS |= dict.fromkeys(("strain [%]", "strain (%)", "strain_percent"), (1.0, 0.01))
 _EXAMPLE = "stretch,stress_MPa"
 
 

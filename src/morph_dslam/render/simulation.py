@@ -98,8 +98,8 @@ class _World:
     def visible(self, frame: int, points: Array, nodes: Array, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which surface points are in the image with nothing in front of them.
 
-        What the object hides of itself is found by the points' rays, exactly; a depth image has no place between
-        pixels, and thin objects have two faces nearer to each other than its steps on a slope.
+        What the object hides of itself is found by the points' rays, exactly. A depth image would not do: on a slope
+        its depth changes from pixel to pixel by more than a thin object is thick.
 
         Parameters
         ----------
